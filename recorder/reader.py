@@ -20,8 +20,8 @@ from recorder.contents.samples import build_samples, row_times_s
 from recorder.files import schemas
 from recorder.files.chunks import Chunk
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.samples import Samples, joined
-from rig.base.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
+from rig.base.samples import Samples, merge_samples
+from rig.base.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, get_schema, sensor_key, truth_key
 from rig.channels.faults.ledger import Declared, sort_blocks
 
 

@@ -387,7 +387,7 @@ def _has_same_corner(one: Fitted, other: Fitted) -> bool:
 
 def _is_biased(signal: Recorded, channel: Channel) -> bool:
     """Return whether an inverted signal would show in its offset: it is in volts, and the channel has a bias."""
-    return units.kind(signal.unit) == "voltage" and abs(channel.bias_v) > MIN_SIGNAL_NOISES * channel.noise_v
+    return units.get_quantity(signal.unit) == "voltage" and abs(channel.bias_v) > MIN_SIGNAL_NOISES * channel.noise_v
 
 
 def _score_wires(

@@ -161,8 +161,8 @@ def _connect(
             tables.setdefault(own, {})[name] = signal.values if whole else signal.early, rates[name]
     wires = {name: wire for part in tables.values() for name, wire in find_wires(part, sent).items()}
     for name, wire in wires.items():
-        kind = units.kind(recorded[name].unit)
-        other = wire.channel and kind not in ("", "voltage", "number", units.kind(channels[wire.channel].unit))
+        kind = units.get_quantity(recorded[name].unit)
+        other = wire.channel and kind not in ("", "voltage", "number", units.get_quantity(channels[wire.channel].unit))
         if other and wire.likeness < _MIN_LIKENESS:
             wires[name] = replace(wire, channel="", rivals=())
     return {name: wires[name] for name in recorded if name in wires}

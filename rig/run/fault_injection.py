@@ -131,12 +131,12 @@ class FaultInjector:
         Raises:
             InputError: The fault is impossible on them.
         """
-        what = command.what
-        if not isinstance(what, OfBlocks):
-            return find_channels(what, command.channel, self.table, **self._setting._asdict())
-        if isinstance(what, Restart) and self._row_at(tick) == 0:
-            raise InputError("kind", "one that shows from the first row on, such as dropout", what.name())
-        return self.table.groups[find_group(what, command.channel, self.table, self.doors)].names
+        kind = command.what
+        if not isinstance(kind, OfBlocks):
+            return find_channels(kind, command.channel, self.table, **self._setting._asdict())
+        if isinstance(kind, Restart) and self._next_row_tick(tick) == 0:
+            raise InputError("kind", "one that shows from the first row on, such as dropout", kind.name())
+        return self.table.groups[find_group(kind, command.channel, self.table, self.doors)].names
 
     def check_all(self, timed: Iterable[tuple[int, object]]) -> None:
         """Raise an error for the first impossible fault of a scene.
@@ -381,10 +381,10 @@ class FaultInjector:
                 )
                 if speed > 0.0:
                     turn = math.floor(theta / TURN) * TURN
-                    here = np.append(one.begin - TICKS_HZ * (theta - turn) / fast, here)
-                    angles, rates = np.append(turn, angles), np.append(fast, rates)
-            at = At(
-                (here - one.begin) / TICKS_HZ, np.arange(len(here)), self.channels[mark], one.draws[mark], {},
+                    here = np.append(fault.begin - TICKS_HZ * (theta - turn) / speed, here)
+                    angles, rates = np.append(turn, angles), np.append(speed, rates)
+            instants = At(
+                (here - fault.begin) / TICKS_HZ, np.arange(len(here)), self.channels[mark], fault.draws[mark], {},
                 read_nothing, angles, rates, mark_signal,
             )  # fmt: skip
             shown = np.rint(fault.what.edges(here, instants) * FRACTIONS) / FRACTIONS
@@ -479,10 +479,10 @@ class FaultInjector:
         rate = channels[0].rate_hz
         late_s, noise_counts = np.zeros((len(n), len(channels))), np.zeros((len(n), len(channels)))
         for c, (channel, faults) in enumerate(zip(channels, faulty, strict=True)):
-            late = [one for one in faults if acts(one.what, "late_s")]
-            for one in late:
-                late_s[:, c] += one.what.late_s(make_place(one, channel, n, n / rate))
-            loud[:, c] = late[0].noise[channel.name].standard_normal(len(n))
+            late = [fault for fault in faults if acts(fault.what, "late_s")]
+            for fault in late:
+                late_s[:, c] += fault.what.late_s(make_place(fault, channel, n, n / rate))
+            noise_counts[:, c] = late[0].noise[channel.name].standard_normal(len(n))
         # Not before the fault, and with enough samples to interpolate.
         here = (n * _OVERSAMPLING)[:, None]
         instants = np.maximum(here - late_s * (rate * _OVERSAMPLING), np.minimum(here, twin.first + _NODES - 1))

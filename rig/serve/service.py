@@ -445,9 +445,12 @@ class Service(ServedRun):
         for event in entry.events_before:
             self._run_guarded("publishing events", self._publish_event, event)
         if entry.frame is not None:
-            for told in entry.frame.documents:
-                self._guarded(
-                    "publishing faults", self._server.publish, wire.FAULTS, wire.encode_document(finite(told))
+            for document in entry.frame.documents:
+                self._run_guarded(
+                    "publishing faults",
+                    self._server.publish,
+                    wire.FAULTS,
+                    wire.encode_document(replace_nonfinite(document)),
                 )
             for message in entry.frame.messages:
                 self._run_guarded(f"publishing {message.key}", self._publish_block, message)

@@ -324,7 +324,7 @@ class Scorecard:
         rows = [{name: each or None for name, each in asdict(row).items()} for row in self.rows]
         for row, entry in zip(self.rows, rows, strict=True):
             entry |= {"value": row.value, "low": row.low, "high": row.high}
-        return finite({
+        return replace_nonfinite({
             "title": self.title, "path": self.path, "outcome": self.outcome.value, "good": self.outcome is Outcome.PASS,
             "verdict": self.verdict_line, "doubts": self.doubts, "limits": self.limits, "rows": rows,
             "defects": self.defects, "remarks": self.remarks, "runs": self.runs,

@@ -58,7 +58,7 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
                     data.append(bytes(frame.data))
                     times_s.append(frame.timestamp)
     except Exception as error:  # whatever python-can raises on a log that it cannot read
-        reason = unreadable(path, error) if isinstance(error, OSError) else None
+        reason = build_read_error(path, error) if isinstance(error, OSError) else None
         raise reason or InputError("FILE", "an intact CAN log", Words(f"{path} ({type(error).__name__})")) from None
     fd = any(messages.by_name[name].fd for name in frames)
     found = []

@@ -177,9 +177,9 @@ def scales(unit: str, channel: Channel, values: np.ndarray, counts: np.ndarray) 
         values: Some recorded values [unit of the file], shape (n,).
         counts: Some of the counts that were sent, shape (m,).
     """
-    has_unit, kind, bits = units.canonical(unit) != "1", units.kind(unit), channel.adc_bits
+    has_unit, kind, bits = units.canonical(unit) != "1", units.get_quantity(unit), channel.adc_bits
     found = [Scale(1.0, 0.0, "counts")] if kind == "" or not has_unit else []
-    if not has_unit or kind == units.kind(channel.unit):
+    if not has_unit or kind == units.get_quantity(channel.unit):
         size = units.size_si(channel.unit) / units.size_si(unit) if has_unit else 1.0
         found.append(Scale(channel.scale * size, channel.offset * size, channel.unit))
     if not has_unit or kind == "voltage":

@@ -25,13 +25,13 @@ _MAX_WAITING = 1100
 """Blocks that wait for an earlier one: as many as arrive during the longest delay of a fault."""
 
 
-class _SentBlock(Outside, extra="ignore"):
+class _SentBlock(StrictModel, extra="ignore"):
     index: Count
     tick: Annotated[int, Field(ge=0, le=2**53)]
     doors: list[str]
 
 
-class _DeclaredBlock(Outside, extra="ignore"):
+class _DeclaredBlock(StrictModel, extra="ignore"):
     key: str
     row: Count
     rows: Annotated[int, Field(gt=0, le=2**40)]
