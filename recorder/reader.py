@@ -161,7 +161,7 @@ class Recording:
         streams: dict[str, Stream] = {}
         for survey in self._surveyed():
             for key, later in survey.streams.items():
-                streams[key] = streams[key].then(later) if key in streams else later
+                streams[key] = streams[key].extend(later) if key in streams else later
         return dict(sorted(streams.items()))
 
     @property

@@ -329,8 +329,8 @@ class FaultInjector:
             for name, faults in plan.converters.items():
                 (group, c), channel = plan.homes[name], self.channels[name]
                 values, t = counts[group][:, c].astype(float), n / rate
-                for one in faults:
-                    values = one.what.counts(values, make_place(one, channel, n, t))
+                for fault in faults:
+                    values = fault.what.counts(values, make_place(fault, channel, n, t))
                 most = 2.0 ** (channel.adc_bits - 1)
                 counts[group][:, c] = np.clip(values, -most, most - 1.0)
             found |= counts

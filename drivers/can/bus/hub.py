@@ -281,12 +281,12 @@ class Hub(Closing):
         """
         self._advance(now)
         next_ns = self._model.next_ns()
-        waiting, may_send = self.endpoints.waiting, self._messages.left(now * 1e-9) >= 1.0
+        waiting, may_send = self.endpoints.waiting, self._messages.count_tokens(now * 1e-9) >= 1.0
         single, idle = len(self.endpoints) < 2, self._model.idle
         tick_ns = _SINGLE_TICK_NS if single else _TICK_NS
         messages: list[codec.HubMessage] = []
         if self._outbox and (now >= self._published_ns + tick_ns or (may_send and (not waiting if single else idle))):
-            self._messages.take()
+            self._messages.remove_token()
             self._published_ns = now
             messages += self._empty_outbox()
         if now >= (self._last_report_ns + _MIN_REPORT_NS if self._report_due else self._next_report_ns):
@@ -303,7 +303,7 @@ class Hub(Closing):
             # A frame that is offered later cannot end before that.
             next_ns = max(next_ns, now) + _RETRY_NS if idle else max(next_ns, now + _RETRY_NS)
             # More than this frame waits: send them in one batch.
-            wake_ns = max(next_ns, tick_ns) if waiting > 1 or self._messages.left(now * 1e-9) < 1.0 else next_ns
+            wake_ns = max(next_ns, tick_ns) if waiting > 1 or self._messages.count_tokens(now * 1e-9) < 1.0 else next_ns
         if self._outbox:
             wake_ns = min(wake_ns, tick_ns)
         # No offer can end before a frame on the wire, nor is it missed by a single endpoint.
@@ -335,9 +335,9 @@ class Hub(Closing):
         for row in np.flatnonzero(results["outcome"]).tolist():
             text = OUTCOMES[results["outcome"][row]]
             end_ns = int(results["end_ns"][row])
-            kept[row] = text in _WIRE_ERRORS and self._errors.left(end_ns * 1e-9) >= 1.0
+            kept[row] = text in _WIRE_ERRORS and self._errors.count_tokens(end_ns * 1e-9) >= 1.0
             if kept[row]:
-                self._errors.take()
+                self._errors.remove_token()
             if text in _WIRE_ERRORS:
                 self._counts["errors"] += 1
                 kind, data = _WIRE_ERRORS[text]

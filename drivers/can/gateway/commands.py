@@ -222,9 +222,9 @@ class Commands:
     ) -> None:
         """Count and report the refusal of a command, or of a frame with that counter."""
         self.refused[result.name.lower()] += 1
-        if self._refusal_limit.left(self._now()) >= 1.0:
+        if self._refusal_limit.count_tokens(self._now()) >= 1.0:
             # Limited, so that a flood of invalid frames does not cause a flood of replies.
-            self._refusal_limit.take()
+            self._refusal_limit.remove_token()
             if isinstance(what, DeviceRequest):
                 self._refuse_device(what.node)
                 return

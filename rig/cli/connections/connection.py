@@ -215,7 +215,7 @@ def print_addresses(server: ZenohServer, exposed: Exposure | None, name: str | N
         echo(f"rig: exposed at {exposed.endpoint} to holders of certificates (permissions: rig keys)", err=True)
         echo(f"rig: certificate of the rig: {own}", err=True)
     elif exposed is not None:
-        doors = ", ".join(door.what for door in (*ROLES["operator"], TRUTH))
+        doors = ", ".join(permission.title for permission in (*ROLES["operator"], TRUTH))
         echo(f"rig: WARNING: {exposed.endpoint} is open to every client, unencrypted:", err=True)
         echo(f"rig: WARNING: {doors}", err=True)
     name_text = "" if name is None else f" as {name}"
