@@ -303,7 +303,9 @@ def find_entry_points(group: str) -> tuple[Any, ...]:
     return tuple(entry_points(group=group))
 
 
-def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> tuple[dict[str, Extension], list[str]]:
+def load_extensions(
+    group: str, kind: type[Extension], used_names: Iterable[str]
+) -> tuple[dict[str, Extension], list[str]]:
     """Return the entries that other packages add to a table, by name, and why others are unusable.
 
     Args:

@@ -23,7 +23,7 @@ from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import COLUMN
 from rig.physics.levels import ModelLevels
 from rig.physics.parameters import DEFAULT_SET, ParameterSet, apply_changes, load_parameters
-from rig.run.commands.table import SpeedCommand, TimedCommand, with_faults
+from rig.run.commands.table import SpeedCommand, TimedCommand, nest_faults
 from rig.run.model_choice import Pick, digest, equations_digest
 from rig.run.speed_target import Drive
 
