@@ -32,8 +32,8 @@ from rig.physics.kernels import signals as S
 from rig.physics.kernels.laws.magnet import LINEAR, RADIAL, RIPPLED, magnet_force
 from rig.physics.levels import ModelLevels
 from rig.physics.magnets import (
+    MAX_REACH_M,
     MU_0,
-    REACH,
     MagnetGeometry,
     MagnetMap,
     cylinder_force,
@@ -151,7 +151,7 @@ def test_far_apart_magnets_are_dipoles() -> None:
 
 def test_quadrature_converges_geometrically() -> None:
     # The narrowest gap of the family: 1 mm, at the end of the reach.
-    distance = TABLE_1.bearing_radius - REACH
+    distance = TABLE_1.bearing_radius - MAX_REACH_M
     exact = pair_force(distance, TABLE_1, nodes=96)
     errors = [abs(pair_force(distance, TABLE_1, nodes=nodes) / exact - 1) for nodes in (4, 8, 12, 16)]
     assert errors[0] < 1e-3
@@ -213,7 +213,7 @@ def test_field_sum_overstates_the_cylinders_of_table_1() -> None:
     # Toward a magnet, by 2.27 at the centre and 3.61 at 10 mm; between the single magnets 1.6 (25 mm) to 3.5 (15 mm).
     assert field_sum_stiffness(TABLE_1) == pytest.approx(1.667e3, rel=1e-3), "eq. 35 gives 1.67 kN/m"
     assert field_sum_stiffness(TABLE_1) / cylinder_stiffness(TABLE_1) == pytest.approx(2.266, abs=0.005)
-    x, y = np.zeros(1), np.array([-REACH])
+    x, y = np.zeros(1), np.array([-MAX_REACH_M])
     ratio = field_sum_force(x, y, TABLE_1)[0, 1] / cylinder_force(x, y, TABLE_1)[0, 1]
     assert ratio == pytest.approx(3.611, abs=0.005)
     assert field_sum_force(x, y, TABLE_1)[0, 1] == pytest.approx(40.0, abs=1.0), "Fig. 7"
@@ -233,10 +233,10 @@ def test_far_field_map_follows_the_field_sum() -> None:
     assert fitted.terms == RADIAL
     assert fitted.error < 0.08
     assert fitted.stiffness == pytest.approx(1670.0, rel=0.02)
-    hardening = 1 + fitted.a3 * REACH**2 + fitted.a5 * REACH**4 + fitted.a7 * REACH**6
+    hardening = 1 + fitted.a3 * MAX_REACH_M**2 + fitted.a5 * REACH**4 + fitted.a7 * REACH**6
     assert hardening == pytest.approx(2.3, abs=0.15), "Fig. 7 hardens by that much"
     constants = model_of("map").constants.magnet
-    assert constants.stiffness * REACH * hardening == pytest.approx(40.0, abs=3.0)
+    assert constants.stiffness * MAX_REACH_M * hardening == pytest.approx(40.0, abs=3.0)
     far = fit_map(MagnetGeometry(16, 16.9e-3, 6e-3, 8e-3, 40e-3, 705e3))
     assert far.error < 1e-3, "many magnets far apart are rotationally symmetric"
 
@@ -250,7 +250,7 @@ def test_cylinder_map_follows_the_cylinders(number: int, over_reach: float, over
     assert fitted.terms == RIPPLED
     assert fitted.stiffness == cylinder_stiffness(geometry)
     errors = []
-    for radius in (REACH, 4e-3):
+    for radius in (MAX_REACH_M, 4e-3):
         x, y = sample_disc(geometry, radius)
         exact = np.asarray(cylinder_force(x, y, geometry))
         missed = np.linalg.norm(map_force(x, y, fitted) - exact, axis=-1).max()
@@ -263,7 +263,7 @@ def test_cylinder_map_follows_the_cylinders(number: int, over_reach: float, over
 
 def test_ripple_is_worth_its_term() -> None:
     fitted = fit_cylinder_map(TABLE_1)
-    x, y = sample_disc(TABLE_1, REACH)
+    x, y = sample_disc(TABLE_1, MAX_REACH_M)
     exact = cylinder_force(x, y, TABLE_1)
 
     def missed(magnet_map: MagnetMap) -> float:
@@ -292,7 +292,7 @@ def test_force_is_the_gradient_of_the_potential(magnet_map: MagnetMap) -> None:
     m = magnet_map
     terms = [1.0, m.a3, m.a5, m.a7]
     h = 1e-6
-    for x, y in zip(*sample_disc(TABLE_1, 0.9 * REACH, points=40), strict=True):
+    for x, y in zip(*sample_disc(TABLE_1, 0.9 * MAX_REACH_M, points=40), strict=True):
         r, angle = math.hypot(x, y), math.atan2(x, -y)
         potential = sum(a * r ** (2 * i + 2) / (2 * i + 2) for i, a in enumerate(terms))
         potential += m.ripple * r**m.number * (1 + m.growth * r * r) * math.cos(m.number * angle)
@@ -307,7 +307,7 @@ def test_force_is_the_gradient_of_the_potential(magnet_map: MagnetMap) -> None:
 
 
 def test_force_turns_with_the_magnets(magnet_map: MagnetMap) -> None:
-    x, y = sample_disc(TABLE_1, REACH, points=40)
+    x, y = sample_disc(TABLE_1, MAX_REACH_M, points=40)
     plain = map_force(x, y, magnet_map) @ [1.0, 1j]
     turn = np.exp(2j * math.pi / magnet_map.number)
     there = turn * (x + 1j * y)
@@ -349,7 +349,7 @@ def test_sag_on_exact_cylinders(number: int, tolerance: float) -> None:
     model = model_of("cylinders", magnet__stiffness="cylinders", magnet__count=number, magnet__magnetisation=1000.0)
     shaft = model.constants.shaft
     depth = model.sag * shaft.arm_magnet / shaft.arm_ring
-    assert -0.9 * REACH < depth < 0.0
+    assert -0.9 * MAX_REACH_M < depth < 0.0
     lift = cylinder_force(np.zeros(1), np.array([depth]), model.magnets)[0]
     share = shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_magnet
     assert lift[1] == pytest.approx(share, rel=tolerance)
@@ -400,7 +400,7 @@ def test_errors_are_found_nowhere_else_larger(number: int) -> None:
     travel = 4e-3
     far_field, cylinders = fit_map(geometry), fit_cylinder_map(geometry)
     sum_k, exact_k = field_sum_stiffness(geometry), cylinder_stiffness(geometry)
-    for index, radius in enumerate((REACH, travel)):
+    for index, radius in enumerate((MAX_REACH_M, travel)):
         x, y = sample_disc(geometry, radius, points=2000)
         r, place = np.hypot(x, y), np.stack([x, y], axis=-1)
         hard = 1 + far_field.a3 * r**2 + far_field.a5 * r**4 + far_field.a7 * r**6
