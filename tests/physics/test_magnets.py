@@ -233,7 +233,7 @@ def test_far_field_map_follows_the_field_sum() -> None:
     assert fitted.terms == RADIAL
     assert fitted.error < 0.08
     assert fitted.stiffness == pytest.approx(1670.0, rel=0.02)
-    hardening = 1 + fitted.a3 * MAX_REACH_M**2 + fitted.a5 * REACH**4 + fitted.a7 * REACH**6
+    hardening = 1 + fitted.a3 * MAX_REACH_M**2 + fitted.a5 * MAX_REACH_M**4 + fitted.a7 * MAX_REACH_M**6
     assert hardening == pytest.approx(2.3, abs=0.15), "Fig. 7 hardens by that much"
     constants = model_of("map").constants.magnet
     assert constants.stiffness * MAX_REACH_M * hardening == pytest.approx(40.0, abs=3.0)
