@@ -60,24 +60,24 @@ class DeviceRequest:
 def device_messages(rig: str, controller: str, time: str) -> list[CanMessage]:
     """Return the messages, with the names of the two sending nodes and the label of a time."""
     join, done, leave = ((int(kind),) for kind in DeviceKind)
-    node = Signal("node", 8, 8, label="The device; any number that no other device on the bus has")
+    node = Signal("node", 8, 8, label="Number of the device, unique on the bus")
     return [
         CanMessage(
             "Device", 0x023, 8, False, math.inf, False, controller,
-            "A device under test, to a rig in lockstep: no block is run before all that have joined are done with the "
-            "one before. Not counted, and harmless to repeat; DeviceState answers join and leave",
+            "From a device under test to a rig in lockstep: a block waits until all joined devices have finished the "
+            "previous one. Without counter, may be repeated; DeviceState replies to join and leave",
             (
                 Signal(
-                    "kind", 0, 8, label="What it says", selects=True,
+                    "kind", 0, 8, label="Kind of message", selects=True,
                     choices={member.value: member.name.lower() for member in DeviceKind},
                 ),
                 node,
                 Signal(
                     "patience", 16, 16, scale=_PATIENCE_STEP_S, unit="s", selected_by=join,
-                    label="How long the rig waits for it, wall time; 0: 10 s",
+                    label="Longest wait of the rig for the device, wall time; 0: 10 s",
                 ),
                 Signal("reserved_join", 32, 16, label="Always 0", selected_by=join),
-                Signal("block", 16, 32, label="Number of the block that it is done with", selected_by=done),
+                Signal("block", 16, 32, label="Number of the block that the device has finished", selected_by=done),
                 Signal("reserved", 16, 32, label="Always 0", selected_by=leave),
                 Signal("key", 48, 8, label=f"Always {KEY:#x}"),
                 Signal(
@@ -88,24 +88,24 @@ def device_messages(rig: str, controller: str, time: str) -> list[CanMessage]:
         ),
         CanMessage(
             "DeviceState", 0x024, 8, False, math.inf, False, rig,
-            "The rig waits for a device from now on, or no longer; lost: not done in time, or with another block",
+            "Start or end of the rig's waiting for a device; lost: not finished in time, or another block",
             (
-                Signal("node", 0, 8, label="The device"),
+                Signal("node", 0, 8, label="Number of the device"),
                 Signal(
-                    "state", 8, 8, label="How the rig holds with it",
+                    "state", 8, 8, label="State of the device",
                     choices={member.value: member.name.lower() for member in DeviceState},
                 ),
                 Signal("reserved", 16, 16, label="Always 0"),
-                Signal("time", 32, 32, unit="us", label=f"Since when. {time}"),
+                Signal("time", 32, 32, unit="us", label=f"Time of the change. {time}"),
             ),
         ),
         CanMessage(
             "Block", 0x320, 8, False, math.inf, False, rig,
-            "In lockstep, while a device has joined: a block is over, and all frames of it went before. A command that "
+            "In lockstep with joined devices: end of a block, sent after all its frames. A command that "
             "was acknowledged before the last device is done takes effect at its end",
             (
-                Signal("block", 0, 32, label="Its number in this run, from 1 on"),
-                Signal("time", 32, 32, unit="us", label=f"Its end. {time}"),
+                Signal("block", 0, 32, label="Number of the block in this run, from 1"),
+                Signal("time", 32, 32, unit="us", label=f"End of the block. {time}"),
             ),
         ),
     ]  # fmt: skip
@@ -120,7 +120,7 @@ def device_frame(
         message: The message `Device` of a table.
         kind: Join, done or leave.
         node: Number of the device, 0 to 255.
-        block: Number of the block that it is done with.
+        block: Number of the block that the device has finished.
         patience_s: When it joins, how long the rig waits for it, in steps of 0.1 [s]; 0 for 10 s.
 
     Raises:

@@ -28,11 +28,11 @@ def fault_signals(channels: ChannelTable) -> tuple[Signal, ...]:
     targets = [*channels.groups, *channels.channels]
     return (
         Signal(
-            "kind", 0, 8, label="What to do", selects=True,
+            "kind", 0, 8, label="Kind of command", selects=True,
             choices={member.value: member.name.lower() for member in FaultKind},
         ),
         Signal(
-            "fault", 16, 8, label=f"Which; its main number is, of {main_numbers}", selected_by=_FAULT,
+            "fault", 16, 8, label=f"Kind of fault; main numbers: {main_numbers}", selected_by=_FAULT,
             choices=dict(sorted((kind.number, name) for name, kind in KINDS.items())),
         ),
         Signal(
@@ -40,10 +40,10 @@ def fault_signals(channels: ChannelTable) -> tuple[Signal, ...]:
         ),
         Signal(
             "number", 32, 12, signed=True, selected_by=_FAULT,
-            label="Main number divided by 10^exponent; a channel by its target; 0: as it is without, if it may be",
+            label="Main number divided by 10^exponent; a channel by its target; 0: the default, if there is one",
         ),
-        Signal("exponent", 44, 4, signed=True, label="Of ten", selected_by=_FAULT),
-        Signal("id", 16, 16, label="Number of the fault that ends; 0: all", selected_by=_CLEAR),
+        Signal("exponent", 44, 4, signed=True, label="Exponent of ten", selected_by=_FAULT),
+        Signal("id", 16, 16, label="Number of the fault to end; 0: all", selected_by=_CLEAR),
         Signal("reserved", 32, 16, label="Always 0", selected_by=_CLEAR),
     )  # fmt: skip
 

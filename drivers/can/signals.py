@@ -126,12 +126,14 @@ def _choices(names: type[IntEnum]) -> dict[int, str]:
 _TIME = "Simulated time, modulo 2^32 us (71.6 min)"
 
 _HEAD = (
-    Signal("counter", 8, 8, label=f"1 to {MAX_LEAD} above that of the last one that reached the rig, modulo 256"),
+    Signal(
+        "counter", 8, 8, label=f"1 to {MAX_LEAD} more than that of the last command received by the rig, modulo 256"
+    ),
     Signal("key", 48, 8, label=f"Always {KEY:#x}"),
     Signal("checksum", 56, 8, label="CRC-8 (SAE J1850) over identifier, low byte first, and the other seven bytes"),
 )
 _STOP_SIGNALS = (
-    Signal("kind", 0, 8, label="What to do", choices={int(CommandKind.STOP): "stop"}),
+    Signal("kind", 0, 8, label="Kind of command", choices={int(CommandKind.STOP): "stop"}),
     Signal("reserved", 16, 32, label="Always 0"),
     *_HEAD,
 )
@@ -163,7 +165,7 @@ def _field_signals() -> Iterator[Signal]:
 
 _COMMAND_SIGNALS = (
     Signal(
-        "kind", 0, 8, label="What to do", selects=True,
+        "kind", 0, 8, label="Kind of command", selects=True,
         choices={value: name for value, name in _choices(CommandKind).items() if value != CommandKind.STOP},
     ),
     *_field_signals(),
@@ -173,31 +175,29 @@ _COMMAND_SIGNALS = (
 
 def _other_messages() -> list[CanMessage]:
     command = (
-        "A command: 8 bytes; kind, counter, key, checksum are checked, bits that the kind does not use must be 0. "
-        "The rig checks ranges and says at which simulated time it takes effect (Acknowledge)"
+        "Command: 8 bytes; kind, counter, key and checksum are checked, unused bits must be 0. "
+        "The rig checks ranges and replies with the simulated time of effect (Acknowledge)"
     )
     shown = ", ".join(frame.shown for frame in _FRAMES.values() if frame.shown)
-    spin = Signal(
-        "spin", 8, 16, scale=0.001, unit="Hz", label="Spin speed of the shaft, as the status has it; 65.535: more"
-    )
+    spin = Signal("spin", 8, 16, scale=0.001, unit="Hz", label="Spin speed of the shaft; 65.535: or more")
     return [
         CanMessage("Stop", 0x010, 8, False, 0.1, False, CONTROLLER, f"Ends the run. {command}", _STOP_SIGNALS),
         CanMessage("Command", 0x020, 8, False, 0.1, False, CONTROLLER, command, _COMMAND_SIGNALS),
         CanMessage(
             "Acknowledge", 0x021, 8, False, 0.05, False, RIG,
-            "What became of a command; beyond a burst of 20, at most 50 refusals a second are acknowledged",
+            "Reply to a command; after a burst of 20, at most 50 refusals per second are acknowledged",
             (
-                Signal("counter", 0, 8, label="That of the command"),
-                Signal("result", 8, 4, label="What became of it", choices=_choices(Result)),
-                Signal("field", 12, 4, label="Value that was out of range", choices=_choices(Field)),
-                Signal("time", 16, 32, unit="us", label=f"When an accepted command takes effect, else now. {_TIME}"),
-                Signal("limit", 48, 16, scale=0.1, label="Limit passed, or number of the fault that began"),
+                Signal("counter", 0, 8, label="Counter of the command"),
+                Signal("result", 8, 4, label="Result of the command", choices=_choices(Result)),
+                Signal("field", 12, 4, label="Field that is out of range", choices=_choices(Field)),
+                Signal("time", 16, 32, unit="us", label=f"Time of effect if accepted, otherwise now. {_TIME}"),
+                Signal("limit", 48, 16, scale=0.1, label="Exceeded limit, or number of the new fault"),
             ),
         ),
         CanMessage(
-            "Event", 0x310, 8, False, 0.1, False, RIG, "Something took effect; behind all samples before it",
+            "Event", 0x310, 8, False, 0.1, False, RIG, "Event in the rig; sent after all earlier samples",
             (
-                Signal("event", 0, 8, label="What", choices=_choices(EventKind)),
+                Signal("event", 0, 8, label="Kind of event", choices=_choices(EventKind)),
                 Signal("number", 8, 8, label="Running number, modulo 256"),
                 Signal("time", 16, 32, unit="us", label=_TIME),
                 Signal("value", 48, 16, scale=0.1, label=shown[0].upper() + shown[1:]),
@@ -205,53 +205,53 @@ def _other_messages() -> list[CanMessage]:
         ),
         CanMessage(
             "Sync", 0x080, 8, False, 0.1, True, RIG,
-            "Ties bus time to the stream: sent when the sample of this number is due, Rates.latency after its time",
+            "Relates bus time to the stream: sent when the sample of this number is due, Rates.latency after its time",
             (
                 Signal("index", 0, 32, label="Number of the sample in the recording"),
-                Signal("time", 32, 32, unit="us", label=f"Its time. {_TIME}"),
+                Signal("time", 32, 32, unit="us", label=f"Time of the sample. {_TIME}"),
             ),
         ),
         CanMessage(
             "Keyphasor", 0x300, 8, False, 0.02, False, RIG,
-            "An exact edge of the keyphasor (the load assumes at most 50 a second)",
+            "Exact edge of the keyphasor (the bus load assumes at most 50 per second)",
             (
                 Signal("number", 0, 16, label="Number of the edge, modulo 65536"),
                 Signal("time", 16, 32, unit="us", label=f"Whole microseconds. {_TIME}"),
-                Signal("fraction", 48, 16, scale=1.0 / 65536, unit="us", label="Rest of the time"),
+                Signal("fraction", 48, 16, scale=1.0 / 65536, unit="us", label="Fraction of the time"),
             ),
         ),
         CanMessage(
-            "Clock", 0x6FF, 8, False, 1.0, True, RIG, "How often the times and the index of other frames have wrapped",
+            "Clock", 0x6FF, 8, False, 1.0, True, RIG, "Whole seconds, to count wraps of time and index",
             (Signal("seconds", 0, 32, unit="s", label="End of the last block, whole seconds of simulated time"),),
         ),
         CanMessage(
-            "Status", 0x700, 8, False, 0.5, True, RIG, "How the rig does; rig/status has it all",
+            "Status", 0x700, 8, False, 0.5, True, RIG, "Status of the rig; rig/status has all of it",
             (
-                Signal("state", 0, 4, label="What the rig does", choices=_choices(RigState)),
-                Signal("warnings", 4, 4, label="Number of warnings; 15: more"),
+                Signal("state", 0, 4, label="State of the rig", choices=_choices(RigState)),
+                Signal("warnings", 4, 4, label="Number of warnings; 15: or more"),
                 spin,
-                Signal("lateness", 24, 16, scale=0.01, unit="ms", label="p99 of the lateness of blocks; 655.35: more"),
+                Signal("lateness", 24, 16, scale=0.01, unit="ms", label="p99 of block lateness; 655.35: or more"),
                 Signal("dropped", 40, 12, label="Sample frames that were not sent, modulo 4096"),
                 Signal("refused", 52, 12, label="Commands refused, modulo 4096"),
             ),
         ),
         CanMessage(
-            "Heartbeat", 0x701, 8, False, 1.0, True, RIG, "The rig is there; without it for 3 s, it has gone",
+            "Heartbeat", 0x701, 8, False, 1.0, True, RIG, "Sign of life; without it for 3 s the rig is lost",
             (
-                Signal("state", 0, 8, label="What the rig does", choices=_choices(RigState)),
+                Signal("state", 0, 8, label="State of the rig", choices=_choices(RigState)),
                 Signal("beat", 8, 8, label="Running number, modulo 256"),
-                Signal("counter", 16, 8, label="Of the last command that reached the rig; the next has one more"),
+                Signal("counter", 16, 8, label="Counter of the last received command; the next has one more"),
                 Signal("time", 24, 32, unit="us", label=f"End of the last block. {_TIME}"),
-                Signal("layout", 56, 8, label="Which sample messages these are; another number: another DBC"),
+                Signal("layout", 56, 8, label="Number of the sample layout; another number needs another DBC"),
             ),
         ),
         CanMessage(
-            "Rates", 0x702, 8, False, 1.0, True, RIG, "How samples were picked",
+            "Rates", 0x702, 8, False, 1.0, True, RIG, "Decimation and latency of samples",
             (
                 Signal("rate", 0, 24, unit="Hz", label="Rate of the recording"),
-                Signal("fd_step", 24, 12, label="Samples from one to the next in FD frames; 0: not sent"),
-                Signal("classic_step", 36, 12, label="Samples from one to the next in classic frames"),
-                Signal("latency", 48, 16, scale=0.01, unit="ms", label="From a sample to when its frame is due"),
+                Signal("fd_step", 24, 12, label="Decimation of samples in FD frames; 0: not sent"),
+                Signal("classic_step", 36, 12, label="Decimation of samples in classic frames"),
+                Signal("latency", 48, 16, scale=0.01, unit="ms", label="Time from a sample to its frame"),
             ),
         ),
     ]  # fmt: skip
@@ -281,8 +281,8 @@ def _sample_signals(samples: SampleLayout, index_label: str) -> tuple[Signal, ..
 
 def _fault_message(table: ChannelTable) -> CanMessage:
     about = (
-        "A fault of a channel or a stream begins, or ends: 8 bytes, checked as those of Command. Acknowledge tells its "
-        "number, and when its first row is; rig/KEYS.md has the equations"
+        "Begin or end of a fault: 8 bytes, checked as those of Command. Acknowledge has its "
+        "number and the time of its first row; rig/KEYS.md has the equations"
     )
     return CanMessage("Fault", 0x022, 8, False, 0.1, False, CONTROLLER, about, (*fault_signals(table), *_HEAD))
 
@@ -308,7 +308,7 @@ def _fd_messages(table: ChannelTable) -> list[CanMessage]:
             name = f"{name}_{position}"
         label = (
             f"{group.title}: {rows} instants of counts as recorded. Every n-th sample of the {group.rate_hz} Hz stream "
-            f"(n = {group.rate_hz // FD_HZ} at {FD_HZ} Hz; Rates.fd_step), not filtered again: "
+            f"(n = {group.rate_hz // FD_HZ} at {FD_HZ} Hz; Rates.fd_step), no further filter: "
             "what lies above half the slower rate folds back"
         )
         index = "Number of the first instant in the recording, modulo 2^32; the others follow by Rates.fd_step"
@@ -329,8 +329,8 @@ def _classic_messages(table: ChannelTable) -> list[CanMessage]:
         samples = SampleLayout(channels[first : first + 3], 1, 2, 2)
         step = samples.channels[0].rate_hz // CLASSIC_HZ
         label = (
-            f"{', '.join(channel.name for channel in samples.channels)}: upper 16 bits of counts; {ABSENT}: not there. "
-            f"Every n-th sample of the stream (n = {step} at {CLASSIC_HZ} Hz; Rates.classic_step), not filtered again: "
+            f"{', '.join(channel.name for channel in samples.channels)}: upper 16 bits of counts; {ABSENT}: no value. "
+            f"Every n-th sample of the stream (n = {step} at {CLASSIC_HZ} Hz; Rates.classic_step), no further filter: "
             "what lies above half the slower rate folds back"
         )
         index = "Number in the recording divided by Rates.classic_step, modulo 65536"

@@ -20,7 +20,7 @@ from drivers.can.message import CanMessage, MessageTable
 from drivers.can.signals import RigState, default_messages, messages_for
 from drivers.link import LinkTimeoutError
 from drivers.sources.samples import Samples
-from drivers.sources.stream import RIG_GONE, decimation_factor
+from drivers.sources.stream import RIG_LOST, decimation_factor
 from rig.base.errors import InputError
 from rig.channels.channel_file import read_channels
 from rig.channels.table import default_table
@@ -287,7 +287,7 @@ class CanSource:
                 # The bus is silent, so all frames of the run have arrived.
                 self._finish("the rig's run has ended")
                 return
-        self._finish(RIG_GONE)
+        self._finish(RIG_LOST)
 
     def take(self, identifier: int, data: bytes) -> int | None:
         """Process a frame; return the state if it is a heartbeat."""

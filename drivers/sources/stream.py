@@ -21,7 +21,7 @@ from rig.serve.transport import Client, NoReplyError
 
 GRACE_S = 2.0
 """Silence that ends a stream after an end event without row counts, and longest absence of the rig [s]."""
-RIG_GONE = "the link to the rig is lost"
+RIG_LOST = "the link to the rig is lost"
 
 
 def decimation_factor(native_hz: float, rate_hz: float) -> int:
@@ -250,7 +250,7 @@ class RigStream:
     def _give_up(self, *, replaced: bool = False) -> None:
         if (self._gone or replaced) and self._rig is not None:
             self._rig = None
-            self._end(RIG_GONE)
+            self._end(RIG_LOST)
 
     def _end(self, reason: str) -> None:
         for key in list(self._subscribed):
