@@ -222,9 +222,9 @@ def test_report_backs_every_section_with_a_table(report: Report, tmp_path: Path)
         "Summary",
         "Figure by figure",
         "Open questions",
-        "The conclusion as a claim: what moves the force toward the measured one?",
-        "When it whirls, and how fast",
-        "What is assumed here",
+        "The paper's conclusion: which changes bring the force closer to the measured one?",
+        "Conditions for whirl, and whirl frequency",
+        "Assumed values",
     ]
     assert sum(isinstance(part, Picture) for part in report.parts) == 13
     assert isinstance(report.parts[0], Picture), "a picture before any table"
@@ -342,7 +342,8 @@ def test_deliberate_corrections_are_not_reported_as_differences(report: Report):
         agrees = abs(kept[printed.key] / printed.value - 1.0) < 5e-3
         assert (row.cells[-1], row.mark) == (("as printed", "plain") if agrees else ("corrected", "open"))
     assert {row.cells[0] for row in table.rows if row.mark == "open"} == {
-        "M_{oh} (as-printed holds M_{ih} + M_{oh})", "K_{ft}, printed of one; both sets hold a pair's k_{T}"
+        "M_{oh} (as-printed contains M_{ih} + M_{oh})",
+        "K_{ft}, printed for one transducer; both sets contain k_{T} of a pair",
     }  # fmt: skip
 
 

@@ -322,7 +322,7 @@ def with_fault(parts: dict[str, Measured], group: str, matrix: np.ndarray, shift
     ("matrix", "shift", "name", "change"),
     [
         (np.diag([1.01, 1.0, 1.0, 1.0]), 0.0, "disk_x gain", "+1 %"),
-        (np.diag([-1.0, 1.0, 1.0, 1.0]), 0.0, "disk_x polarity", "turned round"),
+        (np.diag([-1.0, 1.0, 1.0, 1.0]), 0.0, "disk_x polarity", "inverted"),
         (np.eye(4), 0.002, "disk_x offset", "+0.002 mm"),
         (np.eye(4)[[1, 0, 2, 3]], 0.0, "disk_x and disk_y", "swapped"),
     ],

@@ -60,7 +60,7 @@ def claim_groups(*, ensemble: int) -> Groups:
         changed = Pulse(label=key, parameters="as-printed", changes={key: corrected[key].value})
         groups[f"correction {key}"] = phases(changed, ensemble)
     for scale in SCALES:
-        changed = replace(base, label=f"house x {scale:g}", changes=supports(scale))
+        changed = replace(base, label=f"housing x {scale:g}", changes=supports(scale))
         groups[f"mobility {scale:g}"] = phases(changed, ensemble)
     for name, changed in alternatives().items():
         groups[f"alternative {name}"] = phases(replace(changed, label=name), ensemble)
@@ -90,9 +90,9 @@ def less_mobile() -> dict[str, dict[str, Any]]:
 def alternatives() -> dict[str, Pulse]:
     """Return other readings of the model and of printed values."""
     return {
-        "house rigid": Pulse(changes={"model.stator": "rigid"}),
-        "outer house fixed": Pulse(changes={"model.stator": "inner-house"}),
-        "houses as identified in 2019": Pulse(parameters="dtu-2019"),
+        "rigid housing": Pulse(changes={"model.stator": "rigid"}),
+        "outer housing fixed": Pulse(changes={"model.stator": "inner-house"}),
+        "housings as identified in 2019": Pulse(parameters="dtu-2019"),
         "restitution 0.5": Pulse(changes={"contact.restitution": 0.5}),
         "friction 0.15": Pulse(changes={"contact.friction": 0.15}),
         "drive held at 6.2 Hz": Pulse(changes={"drive.mode": "ideal"}),
@@ -122,9 +122,9 @@ class Bar:
 
 
 _MAX_BARS = 16
-_ENDS = (("white", "low end, or as printed"), (BLACK, "high end, or put right"))
+_ENDS = (("white", "low end, or as printed"), (BLACK, "high end, or corrected"))
 """Fill colour and meaning of the marks at the ends of a bar."""
-COLOURS = {"assumed value": ORANGE, "correction": BLUE, "house": GREEN, "other reading": SKY}
+COLOURS = {"assumed value": ORANGE, "correction": BLUE, "housing": GREEN, "other reading": SKY}
 
 
 def bars(results: Results, quantity: str) -> list[Bar]:
@@ -143,7 +143,7 @@ def bars(results: Results, quantity: str) -> list[Bar]:
     ]
     found += [Bar(CORRECTIONS[key], "correction", (printed, of(f"correction {key}"))) for key in correction_keys()]
     found.append(Bar("all corrections", "correction", (printed, base)))
-    found.append(Bar("house, 1/10 to 10 times as stiff", "house", (of("mobility 0.1"), base, of("mobility 10"))))
+    found.append(Bar("housing, 1/10 to 10 times as stiff", "housing", (of("mobility 0.1"), base, of("mobility 10"))))
     found += [Bar(name, "other reading", (base, of(f"alternative {name}"))) for name in alternatives()]
     found.append(Bar("contact law", "other reading", tuple(of(f"law {law}") for law in LAWS)))
     return sorted(found, key=lambda bar: -bar.width)
@@ -159,12 +159,12 @@ def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
     """Draw the effect of each change on the force in whirl and on the highest reaction."""
     from matplotlib.patches import Patch
 
-    figure = new_figure(11.6, "What moves the force: one change at a time (ranges of assumed values are assumed)")
+    figure = new_figure(11.6, "Effect of single changes on the force (ranges of assumed values are assumed)")
     panels = figure.subplots(2, 1)
     shown = {
         "reaction_x_n": ("E − W amplitude in whirl [N]", MEASURED_N, "last label of the measured axis"),
         "peak_x_n": (
-            "highest E − W in the impacts, median of the phases [N]",
+            "highest E − W in the impacts, median over the phases [N]",
             5000.0,
             "last label of the simulated axis",
         ),
@@ -175,7 +175,7 @@ def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
         values = values[np.isfinite(values)]
         if len(values):
             low, middle, high = np.percentile(values, [5, 50, 95])
-            text_5_95 = f"all assumed values at once:\n{low:.0f} to {high:.0f} N (5 to 95 %)"
+            text_5_95 = f"all assumed values varied:\n{low:.0f} to {high:.0f} N (5 to 95 %)"
             axes.axvspan(low, high, color="0.93", zorder=0, label=text_5_95)
             axes.axvline(middle, color="0.6", lw=1.0, zorder=0)
         axes.axvline(median(results["base corrected"], quantity), color=BLACK, lw=1.2, label="corrected")
@@ -209,7 +209,7 @@ def _draw_bars(axes: Any, widest: list[Bar], level: float) -> None:
 @house_style()
 def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
     """Draw the distributions with all assumed values varied together, and the rank correlation of each value."""
-    figure = new_figure(8.4, f"All assumed values at once: Latin hypercube, {len(spread)} runs")
+    figure = new_figure(8.4, f"All assumed values varied together: Latin hypercube, {len(spread)} runs")
     panels = figure.subplots(2, 2).ravel()
     shown = {
         "reaction_x_n": ("E − W amplitude in whirl [N]", MEASURED_N, "last label of the measured axis"),
@@ -245,24 +245,24 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
 
 @house_style()
 def draw_mobility(results: Results) -> Figure:
-    """Draw peak force, impacts, time to roll and whirl force over the stiffness of the houses' supports."""
-    figure = new_figure(7.2, "Mobility of the houses: stiffness and damping of all supports scaled")
+    """Draw peak force, impacts, time to rolling and whirl force over the stiffness of the supports."""
+    figure = new_figure(7.2, "Mobility of the housings: stiffness and damping of all supports scaled")
     panels = figure.subplots(2, 2, sharex=True)
     shown = {
         "peak_normal_n": "highest normal force [N]",
-        "contacts": "impacts until it whirls [1]",
-        "roll_s": "from the pulse until it rolls [s]",
+        "contacts": "impacts before whirl [1]",
+        "roll_s": "time from pulse to rolling [s]",
         "reaction_x_n": "E − W amplitude in whirl [N]",
     }
     for axes, (name, label) in zip(panels.ravel(), shown.items(), strict=True):
         for scale in SCALES:
             values = column(results[f"mobility {scale:g}"], name)
-            axes.semilogx([scale] * len(values), values, "o", color=SKY, ms=4.5, label="each phase of the turn")
+            axes.semilogx([scale] * len(values), values, "o", color=SKY, ms=4.5, label="each shaft phase")
         middle = [median(results[f"mobility {scale:g}"], name) for scale in SCALES]
-        axes.semilogx(SCALES, middle, color=BLUE, lw=1.8, label="median of the phases")
-        axes.axhline(median(results["alternative house rigid"], name), color="0.4", ls=":", lw=1.6, label="rigid")
+        axes.semilogx(SCALES, middle, color=BLUE, lw=1.8, label="median over the phases")
+        axes.axhline(median(results["alternative rigid housing"], name), color="0.4", ls=":", lw=1.6, label="rigid")
         axes.set(ylabel=label)
     for axes in panels[-1]:
-        axes.set_xlabel("support over the corrected one [1]")
+        axes.set_xlabel("factor on the supports [1]")
     legend_below(figure)
     return figure

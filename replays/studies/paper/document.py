@@ -177,7 +177,7 @@ def _numbers(findings: Findings) -> dict[str, Any]:
         "clearance": open_questions.clearance_numbers(found),
         "tornado": {"idle_n": IDLE_N, "idle": idle_changes(findings)},
         "moves": _moves(findings),
-        "mobility": {f"× {scale:g}": f"mobility {scale:g}" for scale in SCALES} | {"rigid": "alternative house rigid"},
+        "mobility": {f"× {each:g}": f"mobility {each:g}" for each in SCALES} | {"rigid": "alternative rigid housing"},
         "low_passes": dict(zip(BANDWIDTHS_HZ, results["bandwidth"], strict=True)),
         "laws": LAWS,
         "ring": _ring_forces(findings),
@@ -210,7 +210,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
         "stiffer_peak": of("mobility 10", "peak_x_n"),
         "reached": {
             kind: ", ".join(bar.name for bar in reached if bar.kind == kind) or "none"
-            for kind in ("correction", "assumed value", "house", "other reading")
+            for kind in ("correction", "assumed value", "housing", "other reading")
         },
         "corners_hz": [hz for hz, result in low_passes if result.reaction_x_n <= MEASURED_N],
         "whirling": len(whirling),
@@ -226,7 +226,7 @@ def _ring_forces(findings: Findings) -> dict[str, Any]:
     for speed, run in findings.found["corrected"].speeds.items():
         spin = float(np.mean(run["spin_rate"][run.times_s > run.times_s[-1] - 0.3]))
         closed[speed] = condition.normal_force(own, *condition.rolling_circle(constants, spin))
-    rigid = median(findings.results["alternative house rigid"], "normal_n")
+    rigid = median(findings.results["alternative rigid housing"], "normal_n")
     return {"speeds": closed, "closed_n": closed[6.2], "rigid_n": rigid}
 
 

@@ -95,9 +95,9 @@ class Findings:
 
 
 JUDGED_BY = (
-    "ours agrees where at least 95 % of it lies in what the paper states, differs where at most 5 % does, and cannot "
-    "be judged between; assumed: a curve fills more than 2/5 of what its axis' labels span and ends before the next "
-    "would come, a number in the text is met to 1 %"
+    "a result agrees if at least 95 % of it lies in the range that the paper states, differs if at most 5 % does, and "
+    "cannot be judged otherwise; assumed: a curve fills more than 2/5 of the labelled range of its axis and ends "
+    "before the next label would be, and a number in the text is accurate to 1 %"
 )
 """Criterion of agreement, in a line."""
 LENGTHS_MS = (4.0, 5.0, 6.0)

@@ -138,7 +138,7 @@ class Reading(NamedTuple):
 
     value: float
     mode_hz: float
-    """Stiffest vertical mode [Hz]."""
+    """Highest vertical natural frequency [Hz]."""
     forces: tuple[int, ...]
     """E - W and N - S in whirl, then the largest value of each [N]."""
 
@@ -230,7 +230,7 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
 
     orbit = axis("orbit ±1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], "orbit_ring")
     drop = axis("drop ±1 mm, in the ring, Fig. 10", r0, "drop_span")
-    probes = axis("the same, at the probes", r0 * lever, "drop_span")
+    probes = axis("drop ±1 mm, at the probes, Fig. 10", r0 * lever, "drop_span")
     disk = axis("x(t) ±2 mm at the probes, Fig. 12(c)", n["orbit_disk"], "orbit_disk")
     measured = axis("E − W ±500 N, measured, Fig. 15(c)", n["sensed_x"], "peak_sensed")
     east = axis("EAST 0 to 900 N, Fig. 16", n["east"], "east")

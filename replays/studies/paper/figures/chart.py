@@ -45,14 +45,14 @@ def draw_conditions(
     plane.loglog(mu, [critical_whirl(own, float(m)) / (2 * math.pi) for m in mu], color=BLACK, lw=1.8,
                  label="closed form")  # fmt: skip
     plane.plot([t.friction for t in slowest], [t.bare for t in slowest], "o", color=RED, ms=7, mfc="none", mew=1.8,
-               label="gains speed from here up (bare rig)")  # fmt: skip
+               label="gains speed above this (bare rig)")  # fmt: skip
     spins = [abs(rolling_whirl(constants, 2 * math.pi * t.spin_hz)[0]) / (2 * math.pi) for t in least]
     plane.plot([t.bare for t in least], spins, "D", color=BLUE, ms=7, mfc="none", mew=1.8,
-               label="keeps whirling from here on (bare rig)")  # fmt: skip
+               label="continues to whirl above this (bare rig)")  # fmt: skip
     plane.plot([t.full for t in least], spins, "D", color=BLUE, ms=6, label="the same, full rig")
     plane.axhline(own.natural / (2 * math.pi), color="0.5", ls=":", lw=1.2, label="ωₙ on the magnets (eq. 42)")
     plane.plot(constants.contact.friction, 83.7, "*", color=ORANGE, ms=13, label="the paper: µ = 0.25, 83.7 Hz")
-    plane.set(xlabel="friction µ [1]", ylabel="|whirl frequency| [Hz]", ylim=(6, 300), title="What keeps up a whirl")
+    plane.set(xlabel="friction µ [1]", ylabel="|whirl frequency| [Hz]", ylim=(6, 300), title="Friction and whirl")
     plane.legend(loc="upper center", bbox_to_anchor=(0.45, -0.13))
     shown = set()
     for row, start in enumerate(starts):
@@ -65,7 +65,7 @@ def draw_conditions(
     scan.axvline(constants.contact.friction, color="0.5", ls=":", lw=1.2, label="the paper's µ")
     scan.set_yticks(range(len(starts)), [f"{start.force_n:g} N" for start in starts])
     scan.set(xlabel="friction µ [1]", ylabel="pulse of 5 ms at 6.2 Hz", ylim=(-0.6, len(starts) - 0.4),
-             title="What becomes of a pulse")  # fmt: skip
+             title="Motion after a pulse")  # fmt: skip
     scan.legend(loc="upper center", bbox_to_anchor=(0.45, -0.13), ncols=2)
     return figure
 
@@ -127,8 +127,8 @@ def draw_law(sweep: dict[float, Outcome]) -> Figure:
     whirl.set(xlabel="spin [Hz]", ylabel="whirl frequency [Hz]")
     errors = [100 * law_error(result, speed) for speed, result in sweep.items()]
     rigid = [100 * (result.whirl_hz / law_hz(speed)[1] - 1) for speed, result in sweep.items()]
-    error.plot(speeds, errors, "o-", color=RED, label="against −Ω Rₛ/(r₀ + δ)")
-    error.plot(speeds, rigid, "s--", color="0.6", label="against the rigid ring")
+    error.plot(speeds, errors, "o-", color=RED, label="relative to −Ω Rₛ/(r₀ + δ)")
+    error.plot(speeds, rigid, "s--", color="0.6", label="relative to the rigid ring")
     error.set(xlabel="spin [Hz]", ylabel="error [%]")
     for axes in (whirl, error):
         axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.15))

@@ -133,7 +133,7 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         for axes in (force, house):
             axes.set(xlabel="time, first impacts [ms]", xlim=first_impacts(run["penetration"], t))
     _name_first(
-        columns, "y in the ring [mm]", "y [mm]", "SOUTH reaction [N]", "acceleration of the\ninner house [m/s²]"
+        columns, "y in the ring [mm]", "y [mm]", "SOUTH reaction [N]", "acceleration of the\ninner housing [m/s²]"
     )
     legend_below(figure, columns=5)
     return figure

@@ -72,12 +72,12 @@ def _worked_out(findings: Findings) -> Content:
     ]  # fmt: skip
     given = 0.90
     eq_44 = impact(mass=1.0, speed=0.1, stiffness=1e10, exponent=1.5, factor=0.75 * (1.0 - given**2), speed_floor=1e-3)
-    worked.append(("e that eq. 44 returns where 0.90 is asked [1]", given, eq_44.restitution))
+    worked.append(("e that eq. 44 returns for a specified 0.90 [1]", given, eq_44.restitution))
     for axis, zeta in zetas.items():
         of_mass = damping(zeta, "magnet.stiffness", p["shaft.mass"])
         decays = of_mass / damping(1.0, "magnet.stiffness", modal)
         worked.append((f"D_{axis} = 2 ζ_{axis} √(K_mag M), eq. 10, K_mag assumed [N s/m]", None, of_mass))
-        worked.append((f"ζ_{axis} of a free decay with it, D_{axis}/(2 √(K_mag I_xx/l_0B²)), any K_mag", zeta, decays))
+        worked.append((f"ζ_{axis} of that free decay, D_{axis}/(2 √(K_mag I_xx/l_0B²)), any K_mag", zeta, decays))
     rows = []
     for name, printed, ours in worked:
         if printed is None:
@@ -85,7 +85,7 @@ def _worked_out(findings: Findings) -> Content:
             continue
         verdict = "agrees" if abs(ours / printed - 1.0) < 5e-3 else "differs"
         rows.append(Row((name, number(printed), number(ours), verdict), MARKS[verdict]))
-    return Content(("what the text works out", "printed", "ours", "verdict"), rows)
+    return Content(("value derived in the text", "printed", "our result", "verdict"), rows)
 
 
 def idle_changes(findings: Findings) -> list[str]:
@@ -107,7 +107,7 @@ def _tornado(findings: Findings) -> Content:
                  "yes" if there else "no")  # fmt: skip
         return Row(cells, "good" if there else "plain")
 
-    headings = ("change", "kind", "E − W in whirl [N]", "moves it by [N]", "highest E − W [N]")
+    headings = ("change", "kind", "E − W in whirl [N]", "change [N]", "highest E − W [N]")
     return Content((*headings, f"reaches {MEASURED_N:g} N"), [row(bar) for bar in found if bar.name not in idle])
 
 
