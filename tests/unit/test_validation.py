@@ -79,7 +79,7 @@ def make_criteria(*names: str) -> Criteria:
         ('"ring.clearance", "shaft.mass"', '"ring.clearence"', "ring.clearence"),
         ('quantities = ["contact_fraction"]', 'quantities = ["contact_part"]', "contact_fraction"),
         ("rms = 1.01", "rms = 1.01\nrsm = 2.0", "rsm"),
-        ('reason = "Truth has no noise: only rounding may part the two."', 'reason = ""', "truth.reason"),
+        ('reason = "True values have no noise, so only rounding errors may remain."', 'reason = ""', "truth.reason"),
         ("title =", "title", "a TOML file"),
     ],
 )
