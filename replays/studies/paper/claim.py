@@ -143,7 +143,7 @@ def bars(results: Results, quantity: str) -> list[Bar]:
     ]
     found += [Bar(CORRECTIONS[key], "correction", (printed, of(f"correction {key}"))) for key in correction_keys()]
     found.append(Bar("all corrections", "correction", (printed, base)))
-    found.append(Bar("housing, 1/10 to 10 times as stiff", "housing", (of("mobility 0.1"), base, of("mobility 10"))))
+    found.append(Bar("supports, 1/10 to 10 times as stiff", "housing", (of("mobility 0.1"), base, of("mobility 10"))))
     found += [Bar(name, "other reading", (base, of(f"alternative {name}"))) for name in alternatives()]
     found.append(Bar("contact law", "other reading", tuple(of(f"law {law}") for law in LAWS)))
     return sorted(found, key=lambda bar: -bar.width)
