@@ -301,7 +301,7 @@ def test_a_bus_of_another_kind_is_refused(way: str) -> None:
         (can.Message(arbitration_id=0x800, is_extended_id=False), "more than 11 bits"),
         (can.Message(arbitration_id=-1), "29 bits"),
         (can.Message(data=bytes(9)), "9 bytes in a classic frame"),
-        (can.Message(data=bytes(9), is_fd=True), "no CAN FD length"),
+        (can.Message(data=bytes(9), is_fd=True), "not a CAN FD length"),
         (can.Message(is_error_frame=True), "error frame"),
         (can.Message(is_fd=True, is_remote_frame=True), "remote frame"),
     ],
