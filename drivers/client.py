@@ -316,8 +316,8 @@ class Rig(Console):
 
         In lockstep the rig waits for this client as for a device `name`, and continues when the loop requests the next
         block: a command sent before takes effect at the end of the block, however loaded the computer is. The client
-        does
-        not step the rig; the test bench does. Missing samples split a block, and the samples after them report the gap.
+        does not step the rig; the test bench does. Missing samples split a block, and the samples after them report the
+        gap.
 
         Args:
             patience_s: Longest time that the rig waits for this client [s of wall time].

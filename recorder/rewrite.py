@@ -46,7 +46,7 @@ class Rewritten:
         counts: Totals of the new file.
         damaged: Number of damaged records of the source that were skipped.
         unchecked: Data of the source without a checksum.
-        short: Rows that the source states and does not contain.
+        short: Losses of the source by its own counts, as lines of text.
     """
 
     path: Path
@@ -134,7 +134,7 @@ def recover(
 
 
 def _lost_ends(recording: Recording) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the row ranges, as stated by the file, of streams that lost rows at their start or end.
+    """Return the first and last rows, as stated by the file, of streams that lost rows at their start or end.
 
     Returns:
         Number of the first row, and number of the row after the last one, by key.

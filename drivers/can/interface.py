@@ -174,8 +174,7 @@ class HubBus(NodeBus):
         Args:
             records: As for `send_records`, at most as many as a transmit queue holds.
             due_ns: Time at which the controller receives each frame [ns of the hub's clock, usually
-                `time.monotonic_ns`],
-                shape of `records`; a time in the past means now.
+                `time.monotonic_ns`], shape of `records`; a time in the past means now.
             timeout: Longest wait for room in the transmit queue [s]; frames that are not due take room as well.
 
         Raises:

@@ -1,10 +1,9 @@
 """Messages in a stream of bytes: consistent overhead byte stuffing and a CRC-16; does no input or output itself.
 
-A frame is a zero byte, the message and its CRC-16 (CCITT polynomial 0x1021, initial value 0, as XMODEM; most
-significant
-byte first), both stuffed to contain no zero byte, and a zero byte. A reader that starts in the middle, or receives a
-corrupted frame, resynchronises at the next zero. Stuffing: S. Cheshire and M. Baker, "Consistent overhead byte
-stuffing", IEEE/ACM Transactions on Networking 7 (1999) 159-172.
+A frame is a zero byte, the message with its CRC-16, and a zero byte. Message and CRC are stuffed to contain no zero
+byte. The CRC has the CCITT polynomial 0x1021 and the initial value 0, as in XMODEM, most significant byte first. A
+reader that starts in the middle, or receives a corrupted frame, resynchronises at the next zero. Stuffing: S. Cheshire
+and M. Baker, "Consistent overhead byte stuffing", IEEE/ACM Transactions on Networking 7 (1999) 159-172.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ _CRC = struct.Struct(">H")
 
 
 def stuff(data: bytes) -> bytes:
-    """Return the data encoded without zero bytes; the result is longer by one byte, and by at most 1 byte in 254."""
+    """Return the data encoded without zero bytes: longer by one byte, and by at most one more for every 254 bytes."""
     out = bytearray()
     parts = data.split(b"\0")
     for number, part in enumerate(parts):
@@ -25,7 +24,7 @@ def stuff(data: bytes) -> bytes:
             out.append(_MAX_RUN + 1)
             out += part[:_MAX_RUN]
             part = part[_MAX_RUN:]
-            # A full run implies no zero, so nothing follows it at the end of the data.
+            # A full run has no implied zero after it, so it may end the data.
             if not part and number == len(parts) - 1:
                 return bytes(out)
         out.append(len(part) + 1)
@@ -62,7 +61,7 @@ class Deframer:
     """Extracts messages from bytes that arrive in portions of any size.
 
     Args:
-        max_bytes: Length of the longest message [bytes]; longer ones count as spoilt and are not stored.
+        max_bytes: Length of the longest message [bytes]; longer ones are not stored, and are counted in `spoilt`.
     """
 
     def __init__(self, max_bytes: int) -> None:

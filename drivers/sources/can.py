@@ -123,8 +123,8 @@ class CanSource:
 
     Args:
         spec: INTERFACE:CHANNEL?NAME=VALUE&... of python-can's bus. `layout=fd` or `layout=classic` selects one where
-            both
-            are sent, `channels=FILE.toml` is the rig's channel table, and `node=N` the number as a device under test.
+            both are sent, `channels=FILE.toml` is the rig's channel table, and `node=N` the number as a device under
+            test.
         wait_s: Longest wait for a rig [s]; a rig announces itself once a second.
         table: Messages; by default those of the standard channel table.
         on_frame: Called with name and raw values of each frame of the rig that carries no samples, after the samples

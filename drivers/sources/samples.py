@@ -191,8 +191,7 @@ class RowReader:
 
         Args:
             rows: Number of rows, at least 1; None for the next part as it arrives. Fewer are returned before a gap and
-                at
-                the end.
+                at the end.
             timeout_s: Longest wait [s].
             whole: Whether to wait for all of them; False returns what has arrived, at least one row.
 

@@ -16,9 +16,9 @@ class Part:
     """Part of a recording to play; times are simulated times of the recording [s].
 
     Attributes:
-        from_s: Begin of a pass; None: begin of the recording.
+        from_s: Start of a pass; None: start of the recording.
         to_s: End of a pass; None: end of the recording.
-        start_s: Begin of the first pass; None: `from_s`.
+        start_s: Start of the first pass; None: `from_s`.
         loops: Number of passes; None: unlimited.
     """
 
@@ -30,7 +30,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Begin of a pass, or of the data after a seek.
+    """Start of a pass, or of the data after a seek.
 
     Attributes:
         number: Number of the pass, counted from 1.
@@ -56,8 +56,8 @@ class Passes:
     Attributes:
         part: As given.
         timeline: As given.
-        from_ns: Begin of a pass [ns of simulated time].
-        start_ns: Begin of the first pass [ns of simulated time].
+        from_ns: Start of a pass [ns of simulated time].
+        start_ns: Start of the first pass [ns of simulated time].
 
     Raises:
         InputError: If the recording has no such part.

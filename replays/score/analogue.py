@@ -373,7 +373,7 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
             said = "; ".join(each for each in (f"against {reference.name}", note, odd or filtered) if each)
             skew = None if odd else make_interval(apart, both, 1e9)
             card.add("skew", one.name, skew, of=one.channel, note=said)
-            # A skew that fails does so from each of the begins.
+            # A skew that fails does so from each of the starts.
             if (open_ and card.rows[-1].verdict != FAIL) or (filtered and card.rows[-1].verdict == FAIL):
                 card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["skew"].run)
 
@@ -397,7 +397,7 @@ def _score_wires(
     """Add mapping and polarity of the signals with a gain; a signal with a channel's name must be that channel."""
     fits = {one.name: one for one in found if one.good}
     signs = {name: one.low.gain > 0.0 for name, one in fits.items()}
-    # A begin half a period later inverts all channels of a table, not their biases: one known sign fixes the others.
+    # A start half a period later inverts all channels of a table, not their biases: one known sign fixes the others.
     fixed = {
         name for each in alignments for name in each.names
         if any(not wires[n].turned or _is_biased(recorded[n], fits[n].channel) for n in each.names if n in fits)

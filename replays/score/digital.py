@@ -25,11 +25,11 @@ from replays.score.records.wiring import Wire
 from rig.channels.table import Channel
 
 _BACKLOG_S = 1.0
-"""Time after which rows that waited in a pipe have arrived [s]."""
+"""Initial time for which no latency is measured, because rows that waited in a pipe arrive then [s]."""
 _NAMES = 5
-"""Rows that are named in a line; the document has all."""
+"""Largest number of row ranges in a note; the JSON document has all."""
 _REPEATING_PART = 0.5
-"""Part of recurring rows above which a loss of whole periods is possible."""
+"""Fraction of repeated rows above which the loss of whole periods may go unnoticed."""
 _EDGE_ROWS = 1 << 17
 """Rows on each side of an end of the session that are compared with all of the session."""
 
@@ -119,7 +119,7 @@ def _score_rows(
             longest_s = max(longest_s, float(np.max(delays.times_s - sent_s, initial=-math.inf)))
         if trigger is None and session.trigger_s is not None and len(known):
             after = np.flatnonzero(sent.first_s + since_s >= session.trigger_s)
-            # Row 0 follows any time before the recording.
+            # At row 0 the command may precede the recording: no row is named.
             trigger = at + int(known[after[0]]) if len(after) and at + known[after[0]] else None
         at += len(places)
 
@@ -144,10 +144,10 @@ def _score_rows(
         )
 
     foreign, early = found.foreign, one.early
-    early += int(np.sum(foreign == np.arange(len(foreign)))) if early else 0  # approximately, if some are lost
+    early += int(np.sum(foreign == np.arange(len(foreign)))) if early else 0  # inexact by some rows if rows are lost
     after = foreign[(foreign + found.last - found.last_row >= found.sent) & (foreign > found.last_row)]
     foreign = foreign[early - one.early : len(foreign) - len(after)]
-    # Rows before a session may equal judged rows of it, as rows do that a DAQ had recorded earlier.
+    # Unjudged rows may equal judged ones, for example if the DAQ had recorded the same signal earlier.
     ends = ((early, early, "first", "before"), (len(after), at - len(after), "last", "after"))
     for rows, edge, which, side in (each for each in ends if each[0]):
         card.remarks.append(f"{table}: the {which} {rows} rows are not judged: they are {side} the session's {which}")
@@ -172,7 +172,7 @@ def _score_rows(
             f"arrival here less that of the rig's block, after {_BACKLOG_S:g} s; at most {longest_s:.2g} s; "
             f"a line through a pipe takes {arrivals.floor_s:.2g} s"
         )
-        if (late := estimates["latency"]) is not None:  # without a limit, its row is not one of the first
+        if (late := estimates["latency"]) is not None:  # as a remark, because a row without a limit is listed late
             card.remarks.append(f"{table}: latency {1e3 * late[0]:.3g} ms, at most {1e3 * longest_s:.2g} ms")
     for quantity, estimate in estimates.items():
         card.add(quantity, table, estimate, note=notes.get(quantity, ""))

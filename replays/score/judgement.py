@@ -149,7 +149,7 @@ def _connect(
     recorded: Mapping[str, Recorded], sent: Mapping[str, tuple[np.ndarray, float]], channels: Mapping[str, Channel],
     rates: Mapping[str, float], *, whole: bool = False,
 ) -> dict[str, Wire]:  # fmt: skip
-    """Return the wires of all signals that have values; tables with separate stamps need not begin together.
+    """Return the wires of all signals that have values; tables with separate stamps need not start together.
 
     The whole record is searched, or its first rows. A signal in another kind of unit than a channel's is assigned to
     that channel only if it is clearly similar.

@@ -1,8 +1,8 @@
 """Least-squares fit of the known signal: y = gain s(t + late + drift t + bend t^2 / 2) + offset, and its residual.
 
-Intervals of these five parameters are those of the block sandwich: the covariance is the spread of scores summed over
-consecutive blocks, so that noise may have any spectrum and be larger where the signal is steep. Errors of the known
-signal itself, as between its samples, are part of the residual, and so of the intervals.
+The covariance of these five parameters is a block sandwich: the spread of scores summed over consecutive blocks. Their
+intervals are therefore valid for noise of any spectrum, and for noise that is larger where the signal is steep. Errors
+of the known signal itself, as between its samples, are part of the residual, and so of the intervals.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from replays.score.records.stimulus import Stimulus
 
 _MAX_STEPS, _MAX_FINAL_STEPS = 4, 3
 _STEP_TOLERANCE = 1e-3
-"""A step below this part of its standard deviation is the last."""
+"""Step, as a fraction of the parameter's standard deviation, below which the iteration ends."""
 _MIN_SAMPLES = 400
 """Fewest samples that are fitted."""
 _TAPS = 96
@@ -30,7 +30,7 @@ _ORDERS = 8
 _SETTLING = 8.0
 """Periods of the corner that are excluded at each end of a record, for a filter to settle."""
 _LOG_STEP, _MAX_LOG_CHANGE = 1e-4, 0.5
-"""Steps of the corner's logarithm: for its derivative, and the largest from its first estimate."""
+"""Logarithm of the corner: step of its numerical derivative, and largest change from its first estimate."""
 _MIN_COHERENCE = 0.8
 """Coherence from which the response at a frequency is valid."""
 
@@ -40,8 +40,8 @@ class Waveform:
     """Result of the fit of one channel.
 
     Attributes:
-        gain, offset, late_s, drift, bend: The five [1, unit, s, s/s, 1/s], `late_s` and `drift` means over the record.
-        covariance: Covariance of the five, shape (5, 5).
+        gain, offset, late_s, drift, bend: Fitted values [1, unit, s, s/s, 1/s]; `late_s`, `drift` are means.
+        covariance: Covariance of the five parameters, shape (5, 5).
         freedom: Degrees of freedom of the five variances, shape (5,).
         middle_s, half_s: Middle of the fitted rows by the clock of the file, and half of their length [s].
         times_s: Times of the fitted rows by the clock of the file [s], shape (n,).
@@ -98,10 +98,10 @@ def fit_waveform(
 
     Args:
         values: Recorded values [unit], nan if one is missing, shape (n,).
-        times_s: Even times by the clock of the file [s], shape (n,).
+        times_s: Equidistant times by the clock of the file [s], shape (n,).
         stimulus: The known signal.
-        curve: Time of the stimulus less time of the file, to a part of a period of the signal, by powers of the time
-            from the middle of the file [s, 1, 1/s].
+        curve: First estimate of the time of the stimulus less that of the file, accurate to a fraction of a signal
+            period: coefficients of the powers of the time from the middle of the file [s, 1, 1/s].
     """
     return _solve(values, times_s, stimulus, curve, slice(0, len(values)), final=True)
 
@@ -117,9 +117,9 @@ def _solve(
     values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, curve: tuple[float, float, float], rows: slice, *,
     final: bool,
 ) -> Waveform | None:  # fmt: skip
-    """Fit some rows by Gauss-Newton steps about their own centre; `curve` is about the centre of all rows.
+    """Fit some rows by Gauss-Newton steps; time is centred on these rows, but in `curve` on all rows.
 
-    The clock's drift is fitted over all rows only; otherwise it has a standard deviation of 1 /s.
+    `bend` is fitted only with `final`; otherwise its standard deviation is set to 1 1/s.
     """
     y, t = values[rows], times_s[rows]
     low, high = stimulus.span_s
@@ -155,7 +155,7 @@ def _solve(
         number += 1
         if number > 1 and (small.all() or number >= _MAX_STEPS + (_MAX_FINAL_STEPS if final else 0)):
             break
-    # The initial curve, about this centre, is part of the result.
+    # Add the initial curve, expanded about this centre, to the fitted changes.
     begun = solve(np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0]), start_s)
     begun[: len(moved)] += moved
     residual = residual - jacobian @ step
@@ -313,7 +313,7 @@ def fit_with_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tup
 def _fit_filter(
     found: Waveform, stimulus: Stimulus, corner_hz: float, order: int, late_s: float | None
 ) -> tuple[Waveform, Corner] | None:
-    """Return the fit near an approximate corner and delay; the default delay is that of low frequencies."""
+    """Return the fit from an initial corner and delay; by default the filter's delay at low frequencies."""
     span_s = found.times_s[-1] - found.times_s[0]
     places, step_s = _number_rows(found.times_s)
     n = int(places[-1]) + 1

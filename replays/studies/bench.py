@@ -1,7 +1,7 @@
 """Benchmark of the rig: simulated over processor time, with errors; cases alternate in one process.
 
-Measures the processor time of the simulating thread, unaffected by other load, also for single frames; the resulting
-lateness in real time is shown by `rig status`.
+Speed is measured by the processor time of the simulating thread, which other load does not change. This includes single
+frames; `rig status` shows how late a run in real time is.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ CASES = (
 """Cases; the first one is the basis of the ratios."""
 
 PEER_CASES = (("cvode-bdf", 2e-3), ("cvode-adams", 2e-3), ("heyoka", 2e-3), ("heyoka", 1e-6))
-"""Peer, and the total error at which it is timed, with the cheapest sufficient setting of its ladder."""
+"""Peer and target error; the peer is timed at the cheapest setting of its ladder that reaches it."""
 
 
 def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
@@ -137,14 +137,14 @@ def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], No
 
     Args:
         runs: Runs of each case.
-        peers: Time installed other solvers in the same rounds.
+        peers: Whether to time the installed peers in the same rounds.
         frames: Number of frames of 1 ms that are timed separately; 0 for none.
         progress: Function that receives the name of each measurement.
 
     Returns:
-        A JSON document: machine, time until the kernels were ready [s], per case times real time (median, min, max,
-        all), error, energy residual, goal and whether it is reached, and the median ratio to the first case of the
-        same round; per peer the same; the time of a frame.
+        A JSON document: machine, time until the kernels were ready [s]; per case the multiple of real time (median,
+        min, max, all), error, energy residual, goal and whether it is reached, and the median ratio to the first case
+        of the same round; per peer the same; the time of a frame.
     """
     cached = has_compiled_kernels()
     begin = time.perf_counter()
@@ -288,7 +288,7 @@ def _frames(frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
         progress(f"{frames} frames of 1 ms, {name}")
         simulation = Simulation(load_scene("hammer", {**changes, "duration_s": 3600.0}))
         taken = np.empty(frames)
-        with freeze_start_objects():  # as in every run with a pace
+        with freeze_start_objects():  # as in every run with pacing
             for _ in range(100):
                 simulation.advance(_FRAME_TICKS)
             for n in range(frames):

@@ -66,8 +66,7 @@ def compare(model: Model) -> dict[str, Any]:
 
     Returns:
         A JSON document: `geometry`, `stiffness_used_n_m`, `reach_mm`, `travel_mm` (largest distance of the shaft from
-            the
-        magnets' centre in the ring), `quadrature_error`, `overstated` (far-field sum over exact cylinders, at
+        the magnets' centre in the ring), `quadrature_error`, `overstated` (far-field sum over exact cylinders, at
         `displacement_mm` toward a magnet and at the centre), `models` (a list: stiffness with these magnets, force
         toward a magnet and toward the gap between two, with these magnets and at the stiffness used), `errors`.
     """

@@ -70,8 +70,8 @@ class Simulation:
         block_ticks: `advance` takes whole multiples of this [ticks].
         end_tick: End of the scene [ticks].
         row_ticks: Ticks between observed rows.
-        begin: Start from an earlier motion; None: the scene's start.
-        rows_per_kept_row: Rows between those with samples; 1 if some samples fall between rows.
+        begin: Position and speed of the shaft from which the run starts; None: those of the scene.
+        rows_per_kept_row: Rows from one sample instant to the next; 1 if some samples fall between rows.
         command_result: Result of the last command, except its tick: a fault's number, channels and first faulty rows.
         inputs: Inputs of the kernels that commands set.
         pending: Waiting commands with their ticks, in order.
@@ -182,7 +182,7 @@ class Simulation:
 
     @cached_property
     def computed(self) -> tuple[str, ...]:
-        """Names of the model's signals that this run computes: those that are a number at time zero.
+        """Names of the model's signals that this run computes: those that are not NaN at time zero.
 
         Raises:
             InputError: A channel or a truth table needs a signal that is not computed.
@@ -222,7 +222,7 @@ class Simulation:
             for motion, engine, out in zip(self._motions(), self._engines, outputs, strict=True):
                 motion.run(engine, self.model.constants, inputs, out, start, self.tick, stop)
             self.tick = stop
-            # A change on a row acts after it: sensors see the row before the change, then the one after it.
+            # A change at a row takes effect after it: sensors receive the row before the change, then the one after it.
             row, remainder = divmod(stop - start, self.row_ticks)
             if not remainder:
                 counts.append(self._condition(rows[done : row + 1], start + done * self.row_ticks))
@@ -301,7 +301,7 @@ class Simulation:
         accuracy = self._accuracy.copy_completed()
         if text := accuracy.warning():
             warnings.append(text)
-        # If little is dissipated, the ledger must account for the stored energy.
+        # Scale of the residual: the larger of the dissipated and the stored energy.
         turned_over = max(dissipated, abs(float(balance["stored"][0])), 1e-6)
         if abs(residual) > self._method.energy * turned_over:
             text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of the converted energy"
@@ -343,7 +343,7 @@ class Simulation:
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of the same scene; at the start, also from one of the scene without commands.
 
-        Before its first command a run is the same without it.
+        Until its first command, a run is identical to a run without commands.
 
         Raises:
             InputError: The snapshot is of another scene, or after the first command.

@@ -1,10 +1,8 @@
 """Endpoints of a virtual bus: their names, their counts, and the controller of the model that each one has.
 
-A name belongs to the endpoint that has joined under it, as long as that is present: only the secret of that join
-permits
-to offer, set, flush or join again. Messages are sent unencrypted, so this separates only endpoints that cannot read
-each
-other's messages, which is the task of access control.
+A name belongs to the endpoint that has joined under it, as long as that is present: to offer, set, flush or join again,
+a request needs the secret of that join. The secret is sent unencrypted, so it protects only from clients that cannot
+read the messages of others. Keeping them apart is the task of access control.
 """
 
 from __future__ import annotations
@@ -51,11 +49,11 @@ class Endpoint:
         token: Whether its token has been seen, or it needs none.
         secret: Secret that proves that its name is its own.
         offered: Number of frames that it has offered.
-        done: Number of these that no longer wait.
-        dropped: Number of these that were not sent.
+        done: Number of these that are finished, sent or not.
+        dropped: Number of finished frames that were not sent.
         left_s: Time at which it was found to have left [s, monotonic].
         reported: Its last report.
-        bus_offs: Number of its bus-off states at the last report.
+        bus_offs: Number of bus-off states until the last report.
     """
 
     name: str

@@ -124,8 +124,7 @@ class Frame(NamedTuple):
     Attributes:
         identifier: 11 bits, or 29 bits if `extended`; the lower wins the bus.
         data: Up to 8 bytes, in CAN FD a length of `FD_LENGTHS`. For a remote frame only its length counts: the number
-            of
-            bytes requested.
+            of bytes requested.
         extended: Whether the identifier has 29 bits.
         remote: Whether the frame requests data; not in CAN FD.
         fd: Whether it is a CAN FD frame.

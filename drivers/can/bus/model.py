@@ -99,8 +99,7 @@ class BusModel:
         Args:
             name: Name in messages.
             queue: Capacity of the transmit queue [frames], including the one on the wire; frames beyond it are dropped
-                and
-                counted.
+                and counted.
             listen_only: Whether it sends nothing, not even acknowledges.
 
         Returns:
@@ -165,8 +164,7 @@ class BusModel:
 
         Args:
             offers: Array of `drivers.can.bus.frame.RECORD`, which is kept, preferably in the order of its times; `node`
-                is the
-                sender, `time_ns` the time of the offer.
+                is the sender, `time_ns` the time of the offer.
         """
         self._offers.append(offers.view(frames.RECORD))
 
@@ -179,8 +177,7 @@ class BusModel:
 
         Returns:
             Everything that ended by then, in the order of time. If several nodes sent the same frame at once, each has
-            its
-            delivery, with the same times.
+            its delivery, with the same times.
         """
         results = self.advance_records(until_ns)
         if not len(results):

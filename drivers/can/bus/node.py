@@ -264,8 +264,7 @@ class NodeBus(can.BusABC):
 
         Raises:
             CanOperationError: The queue was full too long, the bus does not support the frame, the node only listens or
-                is
-                bus-off, or the hub has stopped.
+                is bus-off, or the hub has stopped.
         """
         self._check_open()
         try:

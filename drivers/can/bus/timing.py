@@ -46,8 +46,7 @@ class Speed(NamedTuple):
     """Bit rates of a bus.
 
     The position of the sample points does not matter here: an FD frame changes its rate at the sample point of BRS and
-    back
-    at that of the CRC delimiter, and together the two bits always last one nominal and one data bit time.
+    back at that of the CRC delimiter, and together the two bits always last one nominal and one data bit time.
 
     Attributes:
         nominal_bit_s: Rate of the arbitration, and of all of a classic frame [bit/s].

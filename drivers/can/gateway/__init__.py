@@ -1,8 +1,7 @@
 """The rig as a node of a CAN bus: sends samples, events and status, receives commands.
 
 A gateway is a client of the rig, in the rig's process or in another one. Threads: the rig's publisher puts blocks into
-a
-bounded queue. The sender packs them and passes each frame to the bus when its last sample is due, or all frames of a
+a bounded queue. The sender packs them and passes each frame to the bus when its last sample is due, or all frames of a
 block at once to a bus that holds them until then. The receiver checks commands, and a worker sends them to the rig and
 acknowledges them. None of these can delay the simulation: what does not fit is dropped, oldest first, and counted.
 """

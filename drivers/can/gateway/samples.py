@@ -51,8 +51,7 @@ class SampleFrames:
 
         Returns:
             The frames that are complete now, or None: numbers of their last instants in the recording, shape (frames,),
-                and
-            their data, uint8, shape (frames, length).
+            and their data, uint8, shape (frames, length).
         """
         first = -(-block.index // self.step)
         counts = block.values[first * self.step - block.index :: self.step]

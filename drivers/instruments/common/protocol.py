@@ -56,7 +56,7 @@ class Tail:
 
 @dataclass(frozen=True, slots=True)
 class InstrumentMessage:
-    """Base of all messages: `KIND`, the `struct` layout of the fields, and the type of a variable last field."""
+    """Base of all messages: number of the kind, `struct` format of the fields, type of a variable last field."""
 
     KIND: ClassVar[int] = 0
     LAYOUT: ClassVar[str] = "<"
@@ -114,7 +114,7 @@ class Stop(InstrumentMessage):
 class Act(InstrumentMessage):
     """Base of an instrument's commands; kinds from 0x40 on, which differ between instruments.
 
-    It has the fields of the rig's command `COMMAND`, with a text for a field that accepts words and numbers.
+    Its fields are those of the rig's command `COMMAND`; a field that accepts a word or a number is sent as text.
     """
 
     COMMAND: ClassVar[str] = ""

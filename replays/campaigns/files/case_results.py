@@ -106,7 +106,7 @@ def parse_limit(text: str, unit: str, *, where: str, of: str) -> Must:
 
 
 def convert_unit(value: float, unit: str, must: Must) -> float:
-    """Convert a value to the unit of its limit; rounds off the errors of the conversion."""
+    """Convert a value to the unit of its limit, and remove the conversion's rounding errors."""
     same = units_of.canonical(unit) == units_of.canonical(must.unit)
     scale = 1.0 if same else units_of.size_si(unit) / units_of.size_si(must.unit)
     return float(f"{value * scale:.12g}")

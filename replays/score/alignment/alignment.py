@@ -1,4 +1,4 @@
-"""Alignment of each table of a record with the session: the begin that explains it best, and the track of its rows."""
+"""Alignment of each table of a record with the session: the start that explains it best, and the track of its rows."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from replays.score.alignment.one_begin import MIN_ROWS, Alignment, Source, find_
 _STRETCHES_S = (0.25, 0.03)
 """Lengths of the first fitted stretch [s]; the second one if clocks differ, or samples are lost, in the first."""
 _MAX_SEARCHES = 3
-"""Searches for begins of a repeating signal, each by the clock of the previous one."""
+"""Searches for starts of a repeating signal, each by the clock of the previous one."""
 
 _EQUAL_LOG_POWER = math.log(2.0)
-"""Largest difference in the logarithm of residual power, summed over signals, at which begins count as equal."""
+"""Largest difference in the logarithm of residual power, summed over signals, at which starts count as equal."""
 
 
 def align(sources: Sequence[Source]) -> Alignment | None:
@@ -33,7 +33,7 @@ def align(sources: Sequence[Source]) -> Alignment | None:
     default = [find_busiest(sources, (within[0], within[1]), round(each * one.rate_hz)) for each in _STRETCHES_S]
 
     def stretches(shift_s: float) -> list[tuple[int, int]]:
-        """Return stretches that are in the session from a begin."""
+        """Return stretches that are in the session from a start."""
         ends_s = [each - one.late_s - shift_s - one.first_s for each in one.stimulus.span_s]
         first, last = (min(rows, max(0, round(each * one.rate_hz))) for each in ends_s)
         if last - first < MIN_ROWS or (first <= default[0][0] and default[0][1] <= last):
@@ -74,7 +74,7 @@ def align(sources: Sequence[Source]) -> Alignment | None:
 
 
 def _follow_best(begins: Begins, sources: Sequence[Source]) -> tuple[list[Alignment], list[Alignment]]:
-    """Return the begins that none surpasses by some signals, and the alignments of the first of them by all signals."""
+    """Return the starts that none surpasses by some signals, and the alignments of the first of them by all signals."""
     alike = begins.find_best()
     shifts_s = [each.begin_s for each in alike[:MAX_FOLLOWED]]
     return alike, [each for s in shifts_s if (each := follow(sources, s, begins.stretches(s)))]
@@ -83,7 +83,7 @@ def _follow_best(begins: Begins, sources: Sequence[Source]) -> tuple[list[Alignm
 def _contradicts(other: Alignment, found: Alignment) -> bool:
     """Return whether an alignment explains the rows about another one's step without a step.
 
-    A lost sample is a step from every begin. Where a signal nearly repeats, an incorrect begin may need steps in place
+    A lost sample is a step from every start. Where a signal nearly repeats, an incorrect start may need steps in place
     of the difference, and with these explain rows after the session's end.
     """
     return any(
@@ -94,9 +94,9 @@ def _contradicts(other: Alignment, found: Alignment) -> bool:
 
 
 def _log_residual_power(found: Alignment, sources: Sequence[Source]) -> float:
-    """Return the logarithm of the residual part of each signal's power from a common begin, summed over the signals.
+    """Return the logarithm of the residual part of each signal's power from a common start, summed over the signals.
 
-    Each signal matches a repeated begin at a slightly different time, as a keyphasor does whose pulses occur at another
+    Each signal matches a repeated start at a slightly different time, as a keyphasor does whose pulses occur at another
     angle of the whirl.
     """
     common_s, total = float(np.median(list(found.own_s.values()))), 0.0

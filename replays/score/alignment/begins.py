@@ -1,4 +1,4 @@
-"""Candidate begins of a record in the session, and the choice of those that explain it."""
+"""Candidate starts of a record in the session, and the choice of those that explain it."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ _NOISES = 1.2
 _BLOCK_ROWS = 200
 """Rows of a block by which residuals are compared: its variance has a standard error of a tenth."""
 _MIN_INVERTED = 4
-"""Number of begins of which some must be upright, if inverted ones are due to a shift by half a period."""
+"""Number of starts of which some must be upright, if inverted ones are due to a shift by half a period."""
 _MIN_POWER_PART = 0.25
 """Power of a block over the mean one, above which the block is compared."""
 EQUAL_BALANCE_PART = 0.98
 """Part of the largest balance above which balances count as equal: the ends of a record cut a period."""
 _MAX_COMPARED = 3
-"""Signals by which begins are compared; each costs a fit."""
+"""Signals by which starts are compared; each costs a fit."""
 _MAX_SEARCHED = 2
-"""Number of these signals by which a begin is selected for following."""
+"""Number of these signals by which a start is selected for following."""
 MAX_FOLLOWED = 4
 """Begins that are followed with all channels: the nearest ones, including those half a period later."""
 _MIN_POWER_RATIO = 1.05
-"""Ratio of residual powers below which begins are never distinguished."""
+"""Ratio of residual powers below which starts are never distinguished."""
 _DEVIATIONS = 6.0
-"""Standard deviations of a residual's power within which begins are not distinguished."""
+"""Standard deviations of a residual's power within which starts are not distinguished."""
 _SAME_ROWS = 0.5
-"""Distance of begins that count as the same [rows]: half of a row is a quarter of the shortest period."""
+"""Distance of starts that count as the same [rows]: half of a row is a quarter of the shortest period."""
 _MAX_POWER_RATIO = 2.0
-"""Residual power of a stretch over the least one, above which a begin is not followed; clocks may differ."""
+"""Residual power of a stretch over the least one, above which a start is not followed; clocks may differ."""
 _EDGE_ROWS = 20
 """Tolerance at the ends of a session [rows], as it is not interpolated there."""
 _OUTLIER_RATIO, _MAX_OUTLIER_PART = 10.0, 0.2
 """Residual over the median one above which a row is faulty, and the largest part of faulty rows."""
 _STRETCH_QUANTILE = 0.25
-"""Quantile of the stretches by which begins are compared: the correct one explains none after a lost sample."""
+"""Quantile of the stretches by which starts are compared: the correct one explains none after a lost sample."""
 _STRETCHES = 6
 """Parts of a record, each with one stretch that is compared before the record is followed."""
 
 
 class Begins:
-    """Candidate begins of a table, compared by the residual power of some signals in blocks of rows.
+    """Candidate starts of a table, compared by the residual power of some signals in blocks of rows.
 
-    Rows outside the session are not compared. Where a signal repeats, begins that explain their rows equally well are
+    Rows outside the session are not compared. Where a signal repeats, starts that explain their rows equally well are
     distinguished by the number of rows in the session, explained or not.
     """
 
@@ -81,7 +81,7 @@ class Begins:
         self._least_power = math.inf
 
     def _measure_residuals(self, shift_s: float) -> np.ndarray:
-        """Return the residual power of stretches from a begin, nan for unexplained ones, shape (signals, n)."""
+        """Return the residual power of stretches from a start, nan for unexplained ones, shape (signals, n)."""
         found = np.full((min(_MAX_SEARCHED, len(self._compared)), len(self._parts)), np.nan)
         for n, part in np.ndindex(found.shape):
             one = self._compared[n]
@@ -111,7 +111,7 @@ class Begins:
         return np.where(power > _MIN_POWER_PART * np.nanmean(power), _block_means(left), np.nan) / (sources * noise**2)
 
     def _exceeds(self, power: np.ndarray, other: np.ndarray) -> bool:
-        """Return whether a begin has a higher residual than another, by the median blocks that both explain."""
+        """Return whether a start has a higher residual than another, by the median blocks that both explain."""
         both = np.isfinite(power) & np.isfinite(other)
         compared = both.any(axis=1)
         limit = max(_MIN_POWER_RATIO, 1.0 + _DEVIATIONS * math.sqrt(2.0 / max(1, _BLOCK_ROWS * both.sum())))
@@ -122,11 +122,11 @@ class Begins:
         return bool(ratios) and float(np.mean(np.log(np.maximum(ratios, 1e-300)))) > math.log(limit)
 
     def find_best(self) -> list[Alignment]:
-        """Return the begins that no other one surpasses: those with most explained rows first, then the nearest."""
+        """Return the starts that no other one surpasses: those with most explained rows first, then the nearest."""
         kept = [each for power, each in self._fits if not any(self._exceeds(power, other) for other, _ in self._fits)]
         if not kept and self._fits:
             kept = [min(self._fits, key=lambda each: float(np.nanmax(_medians(each[0]))))[1]]
-        # A fault of a few rows raises the residual of all: a begin must not win by placing them outside the session.
+        # A fault of a few rows raises the residual of all: a start must not win by placing them outside the session.
         least, excess = min(map(self.penalty, kept), default=0), self._stretch_excess()
         kept += [
             each for _, each in self._fits
@@ -143,9 +143,9 @@ class Begins:
 
     @property
     def _settled(self) -> bool:
-        """True if two begins have a residual of noise alone, and one of them has no unexplained row.
+        """True if two starts have a residual of noise alone, and one of them has no unexplained row.
 
-        A begin that is off by half a period inverts the signal, so one of them must be upright, unless several are
+        A start that is off by half a period inverts the signal, so one of them must be upright, unless several are
         inverted: then the DAQ inverts.
         """
         alike = self.find_best() if self._least_power < 1.0 else []
@@ -155,12 +155,12 @@ class Begins:
         )
 
     def search_more_signals(self) -> None:
-        """Search begins by further signals, which may not repeat where the first one does."""
+        """Search starts by further signals, which may not repeat where the first one does."""
         self._searched, self._least_power = self._compared, math.inf
         self.follow_candidates(self.find_shifts())
 
     def count_outside(self, found: Alignment) -> int:
-        """Return the number of rows outside the session, from a begin, that are as loud as those in it."""
+        """Return the number of rows outside the session, from a start, that are as loud as those in it."""
         first, last = found.track.inside
         loud = _MIN_POWER_PART * float(np.nanvar(self._one.values[first:last]))
         parts = [self._one.values[self._busy[0] : first], self._one.values[last : self._busy[1]]]
@@ -175,9 +175,9 @@ class Begins:
         return (self.count_outside(found) + inside - found.track.explained) // _EDGE_ROWS
 
     def find_shifts(self) -> list[float]:
-        """Return shifts at which the known signal repeats [s], by all rows and by those that the best begin explains.
+        """Return shifts at which the known signal repeats [s], by all rows and by those that the best start explains.
 
-        A lost sample lowers the correlation of all rows, and the begin that then explains most rows may place those
+        A lost sample lowers the correlation of all rows, and the start that then explains most rows may place those
         before the lost sample outside the session.
         """
         alike = self.find_best()
@@ -189,7 +189,7 @@ class Begins:
         return [each for one in self._searched for each in self._find_shifts_in(one, alike[0], parts)]
 
     def _find_shifts_in(self, one: Source, best: Alignment, parts: Sequence[tuple[int, int]]) -> list[float]:
-        """Return the shifts at which a signal matches parts of its record, by the clock of the best begin [s]."""
+        """Return the shifts at which a signal matches parts of its record, by the clock of the best start [s]."""
         values, times_s, curve = best.even(one)
         rows, held = np.arange(len(values)), np.isfinite(values)
         values = np.interp(rows, rows[held], values[held])
@@ -205,13 +205,13 @@ class Begins:
         return [each - one.late_s for each in late_s]
 
     def stretches(self, shift_s: float) -> list[tuple[int, int]]:
-        """Return the stretches by which a begin is followed; the last one is that with the least residual."""
+        """Return the stretches by which a start is followed; the last one is that with the least residual."""
         left = self._residuals[self._shifts.index(shift_s)][0]
         best = [] if np.isnan(left).all() else [self._parts[int(np.nanargmin(left))]]
         return [*self._default(shift_s), *best]
 
     def _rows_inside(self, shift_s: float) -> int:
-        """Return the number of rows in the session from a begin, less quiet rows at the ends of the record.
+        """Return the number of rows in the session from a start, less quiet rows at the ends of the record.
 
         A DAQ that is started before the session, or stopped after it, records such rows.
         """
@@ -221,13 +221,13 @@ class Begins:
         return round(2.0 * max(0.0, busy) - inside)
 
     def _stretch_excess(self) -> np.ndarray:
-        """Return the logarithm of each begin's residual power over the least one, by its best stretches."""
+        """Return the logarithm of each start's residual power over the least one, by its best stretches."""
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # all-nan: unexplained stretches
             apart = np.log(np.array(self._residuals) / np.nanmin(self._residuals, axis=0))
             return np.nanmean(np.nanquantile(apart, _STRETCH_QUANTILE, axis=2), axis=1)
 
     def follow_candidates(self, shifts: Sequence[float]) -> None:
-        """Follow begins until two are equally good and have a residual of noise alone.
+        """Follow starts until two are equally good and have a residual of noise alone.
 
         Begins are ordered by the residual of their stretches, and at equal residuals by the number of rows in the
         session. Earlier candidates that were not followed are included.

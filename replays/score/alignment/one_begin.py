@@ -1,4 +1,4 @@
-"""Alignment of a record with the session from one begin: fits of its signals, and the track of its rows."""
+"""Alignment of a record with the session from one start: fits of its signals, and the track of its rows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MIN_ROWS = 400
 MIN_LIKENESS = 0.5
 """Part of a channel's power that the known signal must explain for the channel to be followed."""
 _SEARCH_RANGE_S = 5e-4
-"""Search range for the begin of a stretch [s]: the error of a correlation if clocks differ."""
+"""Search range for the start of a stretch [s]: the error of a correlation if clocks differ."""
 _MAX_RESIDUAL_RATIO = 0.7
 """Largest ratio of residuals for which the shorter stretch is preferred, as it determines the clock less well."""
 _MAX_FOLLOWERS = 6
@@ -29,9 +29,9 @@ _MIN_EXPLAINED_PART = 0.999
 _MAX_DRIFT = 0.02
 """Largest clock error of a DAQ; a fit with a larger one is wrong."""
 _OVERSAMPLING = 8
-"""Places per sample at which the begin of a stretch is searched."""
+"""Places per sample at which the start of a stretch is searched."""
 _MAX_CANDIDATES = 4
-"""Candidate times near a begin from which a stretch is fitted."""
+"""Candidate times near a start from which a stretch is fitted."""
 
 
 @dataclass
@@ -79,9 +79,9 @@ class Alignment:
         own_s: Session less file time where the track's time error is 0, by followed signal [s].
         first_s, rate_hz, rows: Time of the first row [s], sampling rate [Hz], and number of rows.
         upright: Number of signals with a positive gain.
-        begin_s: Delay of the begin in the session relative to that of the wires [s].
-        ambiguous: Whether other begins explain the record equally well.
-        steps_doubted: Whether another begin explains more rows, by steps that this one does not need.
+        begin_s: Delay of the start in the session relative to that of the wires [s].
+        ambiguous: Whether other starts explain the record equally well.
+        steps_doubted: Whether another start explains more rows, by steps that this one does not need.
     """
 
     names: tuple[str, ...]
@@ -154,7 +154,7 @@ def find_busiest(sources: Sequence[Source], within: tuple[int, int], length: int
 
 
 def _fit_stretches(sources: Sequence[Source], shift_s: float, stretch: tuple[int, int]) -> dict[str, Waveform]:
-    """Return the fits of a stretch from one begin, of the signals that are found in it."""
+    """Return the fits of a stretch from one start, of the signals that are found in it."""
     found = {}
     for one in sources:
         fit = fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, stretch)
@@ -164,7 +164,7 @@ def _fit_stretches(sources: Sequence[Source], shift_s: float, stretch: tuple[int
 
 
 def _refine_begin_s(one: Source, shift_s: float, stretch: tuple[int, int]) -> float:
-    """Return the begin near a given one from which a stretch has the least residual [s]."""
+    """Return the start near a given one from which a stretch has the least residual [s]."""
     y, period_s = np.nan_to_num(one.values[slice(*stretch)]), 1.0 / one.rate_hz
     reach, n = math.ceil(_SEARCH_RANGE_S * one.rate_hz * _OVERSAMPLING), len(y)
     first_s = one.first_s + stretch[0] * period_s + one.late_s + shift_s
@@ -184,11 +184,11 @@ def _refine_begin_s(one: Source, shift_s: float, stretch: tuple[int, int]) -> fl
 
 
 def follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple[int, int]]) -> Alignment | None:
-    """Return the alignment of a record from one begin, or None.
+    """Return the alignment of a record from one start, or None.
 
     Args:
         sources: Signals of the table.
-        shift_s: Shift of the begin relative to that of the wires [s].
+        shift_s: Shift of the start relative to that of the wires [s].
         stretches: Stretches of rows that are tried first.
     """
     best: tuple[float, tuple[int, int], dict[str, Waveform]] | None = None

@@ -16,7 +16,7 @@ from replays.score.records.rows import row_hashes, stretches
 _GROUP_LENGTH = 16
 """Consecutive counts that are hashed together: enough to be distinct in a channel with few levels."""
 _MIN_VOTES = 16
-"""Groups that must agree on the begin of the recording; chance agreements are single ones."""
+"""Groups that must agree on the start of the recording; chance agreements are single ones."""
 _MAX_PLACES, _MIN_VOTE_PART = 8, 0.25
 """Largest number of returned places, and the part of the most votes that each must have."""
 _MAX_EXACT = 2
@@ -62,7 +62,7 @@ def find_begins(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step
     clear = votes[which] >= max(_MIN_VOTES, 0.01 * votes.max())
     clear &= most | ((at < at[first]) & (places < places[first]))
     likeliest = begins[clear][np.argmin(at[clear])][None] if clear.any() else begins[:0]
-    # Most begins of a nearly repeating signal have some unequal rows: one without may have few rows in the session.
+    # Most starts of a nearly repeating signal have some unequal rows: one without may have few rows in the session.
     held, ranked = np.sort(rows), np.argsort(-votes)[: len(votes) if votes.max() >= _MIN_VOTES else 0]
     inside = np.searchsorted(held, (last - values) // step, side="right") - np.searchsorted(held, -(values // step))
     exact = (votes >= _MIN_VOTES) & (votes == inside)

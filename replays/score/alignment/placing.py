@@ -17,13 +17,13 @@ from rig.channels.table import Channel
 _MAX_SCALE_ROWS = 1 << 16
 """Rows of a recording by which its scale is found."""
 _MIN_EQUAL_PART = 0.5
-"""Part of the first rows that must be equal for a begin found by stamps or correlation."""
+"""Part of the first rows that must be equal for a start found by stamps or correlation."""
 _DECIMATION = 64
 """Decimation of the values in which a DAQ's unused bits are searched."""
 _MAX_SEARCHES = 3
 """Signals of a table whose place in the session is searched over the whole of both."""
 _MIN_MOVING = 64
-"""Equal rows that change, from which a begin is certain: fewer are equal by chance at an end of the session."""
+"""Equal rows that change, from which a start is certain: fewer are equal by chance at an end of the session."""
 _MAX_UNEQUAL = 16
 """Unequal values of nearly repeating signals that may be consecutive by chance."""
 
@@ -89,16 +89,16 @@ class _Search:
         return SignalRows(scale, step, phase, max(0, -(begin // step)), start, begin)
 
     def is_better(self, begin: int, other: int, signals: Iterable[tuple[str, str, Scale]], *, known: bool) -> bool:
-        """Return whether all rows in the session are equal from a begin, but not from another one.
+        """Return whether all rows in the session are equal from a start, but not from another one.
 
-        For a nearly repeating signal, other begins have more rows in the session, nearly all of which are equal. The
+        For a nearly repeating signal, other starts have more rows in the session, nearly all of which are equal. The
         unequal ones are then distributed; if they are consecutive, these rows are stale instead.
 
         Args:
             begin: Place of the first row in the session, or negative.
             other: Another such place.
             signals: Signals of one table: name, channel and scale.
-            known: Whether another table of the file has this begin. If so, any unequal row from the other one counts;
+            known: Whether another table of the file has this start. If so, any unequal row from the other one counts;
                 if not, only those that are in the session from both.
         """
         moving, unequal, expected = 0, 0, 0.0
@@ -128,7 +128,7 @@ class _Search:
         return longest, float(same.mean()) if len(same) else 0.0, same
 
     def find_rows(self, name: str, of: str) -> SignalRows | None:
-        """Return the rows of a signal, by the begin of its table if known, otherwise by its counts; or None."""
+        """Return the rows of a signal, by the start of its table if known, otherwise by its counts; or None."""
         signal, channel, step = self._recorded[name], self._session.channels[of], self.find_step(name, of)
         table = id(signal.table)
         _, counts = self.held[channel.group]
@@ -163,7 +163,7 @@ class _Search:
         return self.make_rows(scale, step, begin, channel.group)
 
     def _find_overlaps(self, name: str, of: str, step: int) -> list[int]:
-        """Return candidate begins of the table by all rows of both, for a few signals, as each reads both files."""
+        """Return candidate starts of the table by all rows of both, for a few signals, as each reads both files."""
         signal, channel = self._recorded[name], self._session.channels[of]
         sent, asked = Sent(self._session, [channel.group]), self._searched.setdefault(id(signal.table), set())
         rows = self._session.rows(channel.group)
@@ -216,7 +216,7 @@ def identify_signals(
         if rows or len(asked) < _MAX_SEARCHES:
             asked.append(name)
             identify(name, session.channels)
-    # Rows of a table begin together: where one signal matches from several begins, another one decides.
+    # Rows of a table begin together: where one signal matches from several starts, another one decides.
     for table in {id(recorded[name].table) for name in rows}:
         names = [name for name in rows if id(recorded[name].table) == table]
         choices = list(dict.fromkeys(rows[name].begin for name in names))
@@ -238,7 +238,7 @@ def identify_signals(
         one = rows[name]
         return one.scale.clean and search.compare(name, found[name].channel, one.begin, one.scale)[1] > _MIN_EQUAL_PART
 
-    # Channels of noise alone correlate with none: their counts are found from the begin of another signal.
+    # Channels of noise alone correlate with none: their counts are found from the start of another signal.
     if 2 * len(rows) <= len(wires) and not any(map(is_shown, rows)):
         return found, rows
     for name, wire in wires.items():

@@ -29,7 +29,7 @@ class Quantity:
     Attributes:
         unit: Unit; empty for that of the channel.
         method: Method of the interval.
-        run: Run that makes the quantity conclusive.
+        run: Test run that determines the quantity.
     """
 
     unit: str
@@ -154,7 +154,7 @@ class ScoreRow:
         method: Method of the interval.
         limit: Limits, or None.
         verdict: The verdict.
-        run: Run that makes the quantity conclusive.
+        run: Test run that determines the quantity.
         note: Further information, such as row numbers.
     """
 
@@ -205,8 +205,8 @@ def judge_row(
 ) -> ScoreRow:  # fmt: skip
     """Return a row with its verdict: the whole interval decides, and one that crosses a limit is inconclusive.
 
-    A card has dozens of rows, and one of twenty intervals misses its value: a row fails if its 99.7 % interval is
-    outside.
+    A card has dozens of rows, and one in twenty 95 % intervals misses the true value. A row therefore fails only if its
+    99.7 % interval is outside the limit.
 
     Args:
         path: Path of the scorecard.
@@ -269,7 +269,7 @@ class Scorecard:
         self, quantity: str, channel: str, estimate: Interval | None, *, of: Any = None, unit: str = "", note: str = "",
         **inputs: Any,
     ) -> None:  # fmt: skip
-        """Add a row as `judge_row`, with the limit for the session's channel `of` and for further inputs."""
+        """Judge an estimate by the limit for the session's channel `of` and for further inputs, and add the row."""
         limit = self.asked(self.path, quantity, of, **inputs)
         self.rows.append(judge_row(self.path, quantity, channel, estimate, unit=unit, limit=limit, note=note))
 
@@ -294,7 +294,7 @@ class Scorecard:
 
     @property
     def defects(self) -> dict[str, list[str]]:
-        """Names in the table of defects that explain the failed quantities, by channel."""
+        """Defects (of the table of faults) that explain the failed quantities, by channel."""
         failed: dict[str, set[str]] = {}
         for row in self.rows:
             if row.verdict == FAIL:

@@ -29,7 +29,7 @@ _SMOOTH = ("sine", "two-tone", "chirp", "multisine", "quiet", "recorded")
 MIN_SIGNAL_NOISES = 4.0
 """Smallest level of a channel's signal, over its noise, at which the signal must be found."""
 _BEGIN_SEARCH_S = 30.0
-"""Length of a session in which the begin of a recording is searched [s]."""
+"""Length of a session in which the start of a recording is searched [s]."""
 
 
 class Session:

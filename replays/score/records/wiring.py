@@ -12,11 +12,11 @@ from replays.estimate.runs import true_runs
 from replays.estimate.spectra import correlation, spectrum
 
 _LIMIT, _CHANCE = 0.2, 6.0
-"""Correlation from which a signal counts as found: absolute, and times the square root of its samples."""
+"""Smallest correlation of a found signal: the larger of `_LIMIT`, and `_CHANCE` over the square root of its samples."""
 _EQUAL_PART = 0.95
-"""Part of the best correlation above which another one is not distinguished from it."""
+"""Ratio to the best correlation above which another channel, or lag, remains a candidate."""
 _CLEAR_PART = 0.98
-"""Part of the best correlation above which another one counts as equal; as a correlation, no second search follows."""
+"""Ratio to the best correlation above which two rank equally; also the correlation that needs no second search."""
 _MIN_POWER = 1e-4
 """Power of a stretch over that of the loudest one, above which it is compared in full: the ringing after an impact has
 less than a hundredth."""
@@ -41,7 +41,7 @@ class Wire:
     """Connection of a recorded signal.
 
     Attributes:
-        channel: Name of the rig's channel; empty without a similar one.
+        channel: Name of the rig's channel; empty if no channel is similar.
         polarity: 1 or -1.
         likeness: Correlation, 0 to 1.
         rivals: Other channels with an equal correlation.
@@ -120,19 +120,19 @@ def _sum_likeness(wires: Mapping[str, Wire]) -> float:
 
 
 def _shift(wire: Wire, shift_s: float) -> Wire:
-    """Return a wire to a part of the session that begins later by a shift [s]."""
+    """Convert the times of a wire, found in a part of the session that starts at `shift_s`, to those of the session."""
     others_s = tuple(each + shift_s for each in wire.others_s)
     return replace(wire, late_s=wire.late_s + shift_s, own_s=wire.own_s + shift_s, others_s=others_s)
 
 
 def _busiest_s(recorded: Mapping[str, tuple[np.ndarray, float]], from_s: float, taken_s: float) -> float:
-    """Return the begin of the stretch in which most signals vary most [s]; a short one lies in a long one."""
+    """Return the start of the stretch in which most signals vary most [s]; a short one is searched in a long one."""
     long, short = _STRETCHES_S
     within_s = long if taken_s == short else math.inf
     total: np.ndarray | None = None
     for values, each in recorded.values():
         part = np.nan_to_num(values[round(from_s * each) : round(min(from_s + within_s, 1e9) * each)])
-        if len(part) < 2:  # outlying stamps: less than a row per stretch
+        if len(part) < 2:  # outlying stamps gave a rate of less than a row per stretch
             continue
         steps = np.add.reduceat(np.diff(part) ** 2, range(0, max(1, len(part) - 1), max(1, round(_GRID_S * each))))
         power = steps / max(float(steps.sum()), 1e-300)
@@ -199,7 +199,7 @@ def _find(
             late_s, (from_s, from_s + taken_s), tuple((each - behind) / rate - from_s for each in lags[1:]),
             late_s if turned else late_s + (first + at - lag) / rate,
         )  # fmt: skip
-    # Among equal channels, one that is not named by another signal is preferred.
+    # Among equally similar channels, prefer one whose name no other signal has.
     taken = {name for name, wire in found.items() if wire.channel == name}
     for name, wire in found.items():
         free = [each for each in (wire.channel, *wire.rivals) if each not in taken]
@@ -222,7 +222,7 @@ def _resample(values: np.ndarray, rate: float, wanted: float, seconds: float) ->
 
 
 def _ratio(rate: float, wanted: float) -> int:
-    """Return the samples of a wanted rate per sample at a rate, if a whole number; otherwise 1."""
+    """Return how many samples at the wanted rate equal one at `rate`, if a whole number; otherwise 1."""
     step = round(wanted / rate)
     return step if step > 1 and abs(step * rate / wanted - 1.0) < 1e-9 else 1
 
@@ -230,7 +230,7 @@ def _ratio(rate: float, wanted: float) -> int:
 def _find_spectra(
     sent: Mapping[str, tuple[np.ndarray, float]], rate: float, length: float, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the spectra and the even samples of the sent signals, all of one length."""
+    """Return the spectra and the resampled values of the sent signals, padded to one length."""
     from scipy.fft import next_fast_len
 
     size = 2 * (next_fast_len(-(-size // 2), real=True) or size)
@@ -242,7 +242,7 @@ def _find_spectra(
 
 
 def _stretch_norms(sent: np.ndarray, before: int, n: int) -> np.ndarray:
-    """Return the norm of each channel without its mean in stretches of n, from `before` samples before the session."""
+    """Return the norm of n samples of each channel (less their mean) by lag; lag 0 is `before` samples early."""
     padded = np.pad(sent, ((0, 0), (before + 1, n)))
     sums, squares = np.cumsum(padded, axis=1), np.cumsum(padded**2, axis=1)
     power = squares[:, n:] - squares[:, :-n] - (sums[:, n:] - sums[:, :-n]) ** 2 / n
@@ -252,7 +252,7 @@ def _stretch_norms(sent: np.ndarray, before: int, n: int) -> np.ndarray:
 
 
 def _correlate(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return the correlation with each channel by lag, from `before` samples before the session."""
+    """Return the correlation with each channel by lag; lag 0 is `before` samples before the session."""
     size = 2 * (there.shape[1] - 1)
     here = (here - here.mean()).astype(np.float32)
     whole = correlation(here, there, size)
@@ -261,11 +261,11 @@ def _correlate(here: np.ndarray, before: int, there: np.ndarray, lengths: np.nda
 
 
 def _find_common_lags(curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], zero: int) -> list[int]:
-    """Return the lags at which all signals of a file may begin together, the most probable first.
+    """Return the lags at which all signals of a file may start together, the most probable first.
 
-    A sine has equal peaks at each period, and sequences with different begins have several. Of the peaks that equal
-    the best, that is preferred at which most signals match the channel with their name; then that at which most have
-    the polarity of the most similar channel; then the nearest to zero lag.
+    A sine has equal peaks in every period, and sequences with different starts have several. Of peaks close to the
+    best one, the first is that at which most signals match the channel of their name, then that at which most have
+    the polarity of the most similar channel, then one within `_CLEAR_PART` of the best, then the nearest to zero lag.
 
     Args:
         curves: By lag, each signal's correlation with the most similar channel and with that of its name, and

@@ -21,7 +21,7 @@ class Impact(NamedTuple):
 def impact(
     *, mass: float, speed: float, stiffness: float, exponent: float, factor: float, speed_floor: float
 ) -> Impact:
-    """Return the impact of a free mass on F = K d^n (1 + c d'/v0), v0 = max(speed, speed_floor).
+    """Return the impact of a mass without other forces on F = K d^n (1 + c d'/v0), v0 = max(speed, speed_floor).
 
     m v dv = -K d^n (1 + g v) dd with g = c/v0 separates: K d^(n+1)/(n+1) = m G(v) with the elementary
     G(v) = int_v^speed u/(1 + g u) du. The impact ends at the other zero of G; its duration is int m dv/F.
@@ -73,7 +73,7 @@ def impact(
 
     duration = 0.0
     for part, end in ((before, speed - middle), (after, middle + rebound)):
-        # F and u vanish at the ends, where the integrand is extrapolated.
+        # F and u both vanish at u = 0, so the first thousandth is added as a rectangle.
         value: Any = quad(part, 1e-3 * end ** (1.0 / power), end ** (1.0 / power), epsabs=0.0, epsrel=1e-10)
         first: Any = part(1e-3 * end ** (1.0 / power)) * 1e-3 * end ** (1.0 / power)
         duration += float(value[0]) + float(first)
@@ -91,7 +91,7 @@ def pushed_contact(
 ) -> np.ndarray:
     """Return depth and its rate of a mass pushed by a load into F = K d^n max(0, 1 + c d'/v0), from rest at d = 0.
 
-    Uses Radau at a tolerance of 1e-10; an implicit method, because a small old v0 makes the law very stiff.
+    Uses Radau, an implicit method, at a tolerance of 1e-10, because a small v0 kept from the onset makes the law stiff.
 
     Args:
         mass: m [kg].
@@ -119,10 +119,10 @@ def pushed_contact(
 
 
 class Mode(NamedTuple):
-    """An undamped mode of the houses."""
+    """An undamped mode of the housings."""
 
     frequency_hz: float
-    inner: float  # displacement of the inner house; the larger of the two is 1
+    inner: float  # displacement of the inner housing; the larger of the two is 1
     outer: float
 
 
@@ -139,12 +139,12 @@ def stiffest_mode(*, inner: float, outer: float, link: float, support: float) ->
 RUNGE_KUTTA_4_LIMIT = 2.0 * math.sqrt(2.0)
 """Stability limit of h w, where |R(i h w)| = 1: |R|^2 = 1 - z^6/72 + z^8/576, so z^2 = 8 (on the real axis 2.785)."""
 RUNGE_KUTTA_4_REAL_LIMIT = 2.7852935634
-"""Stability limit of h lambda, where R(-h lambda) = 1 - z + z^2/2 - z^3/6 + z^4/24 reaches 1: the limit for damping."""
+"""Limit of h lambda for damping (real axis), where R(-h lambda) = 1 - z + z^2/2 - z^3/6 + z^4/24 reaches 1."""
 VERLET_LIMIT = 2.0
 
 
 def linear_motion(rates: np.ndarray, constant: np.ndarray, z0: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return the solution of Z' = A z + b by the exponential of the bordered matrix, shape (n, len(z0))."""
+    """Return the solution of z' = A z + b by the exponential of the bordered matrix, shape (n, len(z0))."""
     from scipy.linalg import expm
 
     size = len(z0)

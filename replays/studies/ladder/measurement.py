@@ -243,7 +243,7 @@ def _run_every_step(scene: Scene, candidate: Candidate) -> Iterator[tuple[Simula
 
 
 def _find_rolling_start(scene: Scene, candidate: Candidate) -> float:
-    """Return the begin of lasting rolling [s]; NaN if there is none."""
+    """Return the start of lasting rolling [s]; NaN if there is none."""
     rolls = end = 0
     for simulation, start, rows in _run_every_step(scene, candidate):
         loose = find_sliding(rows, simulation.model.constants.shaft.radius) | (rows[:, COLUMN["penetration"]] <= 0.0)

@@ -15,15 +15,15 @@ from rig.physics.kernels.signals import COLUMN
 from rig.run.motion import DISSIPATED
 
 SETTLED_SHARE = 0.25
-"""Part of a run, at its end, that is the settled phase."""
+"""Length of the settled phase, the last part of a run, as a fraction of the run."""
 MAX_ROLLING_SLIP = 0.02
 """Largest ratio of sliding speed to surface speed of a rolling contact."""
 MIN_SLIDING_SPEED = 1e-4
 """Sliding speed below which a contact counts as rolling even if the shaft stands still [m/s]."""
 MIN_CONTACT_SHARE = 0.5
-"""Part of the settled phase with contact above which the motion is a whirl or rest instead of bouncing."""
+"""Contact share of the settled phase above which the motion is a whirl or rest, and below which it is bouncing."""
 PERMANENT_CONTACT_SHARE = 0.95
-"""Part of the settled phase with contact below which the motion is a partial rub."""
+"""Contact share of the settled phase above which contact is permanent, and below which it is a partial rub."""
 MAX_SHARE_DIFFERENCE = 0.1
 """Largest difference of contact shares of equal outcomes."""
 Value = float | str
@@ -45,7 +45,7 @@ class Trace(NamedTuple):
     first_impact_s: float
     """First impact, located between steps [s]; NaN if there is none or it was not requested."""
     rolls_s: float = math.nan
-    """Begin of lasting rolling [s]; NaN likewise."""
+    """Start of lasting rolling [s]; NaN if there is none or it was not requested."""
 
     def column(self, name: str) -> np.ndarray:
         """Return one signal, shape (n,)."""
@@ -88,7 +88,7 @@ class Ending(NamedTuple):
         return f"{rolls} {'forward' if self.turns > 0.0 else 'backward'} whirl" if abs(self.turns) >= 1.0 else "resting"
 
     def alike(self, other: Ending) -> bool:
-        """Return whether two outcomes are equal, allowing small differences across the limit between two names."""
+        """Return whether two outcomes are equal; near the limit of two names, a small difference is allowed."""
         if self.touches != other.touches or abs(self.contact_share - other.contact_share) > MAX_SHARE_DIFFERENCE:
             return False
         if min(self.contact_share, other.contact_share) <= MIN_CONTACT_SHARE:
@@ -105,7 +105,7 @@ def find_sliding(rows: np.ndarray, surface_radius: float) -> np.ndarray:
 
 
 def find_rolling_start(times_s: np.ndarray, rows: np.ndarray, surface_radius: float) -> float:
-    """Return the begin of lasting rolling in the rows of a whole run [s]; NaN if there is none."""
+    """Return the start of lasting rolling in the rows of a whole run [s]; NaN if there is none."""
     loose = np.flatnonzero(find_sliding(rows, surface_radius) | (rows[:, COLUMN["penetration"]] <= 0.0))
     first = int(loose[-1]) + 1 if len(loose) else 0
     return float(times_s[first]) if first < len(times_s) else math.nan
@@ -113,7 +113,7 @@ def find_rolling_start(times_s: np.ndarray, rows: np.ndarray, surface_radius: fl
 
 def ending(trace: Trace) -> Ending:
     """Return the outcome of a run."""
-    # Contact by the impulse: with an impact law, no instant lies within a contact.
+    # Contact is detected by its impulse, because a contact of an impact law has no duration.
     pushed = np.diff(trace.settled("contact_impulse")) > 0.0
     angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
     rolls = ~find_sliding(trace.rows[-trace.settled_rows :], trace.surface_radius)
@@ -148,7 +148,7 @@ class Quantity:
     resolution: float = 0.0
 
     def error(self, value: Value, reference: Value) -> float:
-        """Return the relative distance of a value from the reference's; infinite if one of them is missing."""
+        """Return the error of a value relative to the reference; infinite if one of the two is missing."""
         if isinstance(value, str) or isinstance(reference, str):
             return 0.0 if value == reference else math.inf
         if value == reference:

@@ -37,9 +37,9 @@ class Late(Kind, number=17):
 
 
 class Clock(Kind, number=18):
-    """A fast clock: a sample of time t since it began is taken at t / (1 + ppm 1e-6), at most 10 ms late.
+    """A fast clock: the sample at time t of the fault is taken at t / (1 + ppm 1e-6), at most 10 ms late.
 
-    A slow one, with ppm below 0, begins 10 ms late, as no sample can be early, and is right after 10 ms / (-1e-6 ppm).
+    A slow clock (ppm below 0) begins 10 ms late, as no sample can be early, and is exact after 10 ms / (-1e-6 ppm).
     """
 
     stage = "clock"
@@ -56,7 +56,7 @@ class Clock(Kind, number=18):
 
 
 class Jitter(Kind, number=19):
-    """Samples late by rms_us (4 + g(n)), white, g within 4: the mean of 4 rms_us is a delay, as none can be early."""
+    """Samples late by rms_us (4 + g(n)), g within -4 to 4. The mean delay, 4 rms_us, avoids samples that are early."""
 
     stage = "clock"
     kind: Literal["jitter"] = "jitter"

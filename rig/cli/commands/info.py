@@ -30,7 +30,7 @@ def info(
     quick: Annotated[bool, typer.Option("--quick", help="Skip the samples, and the verdict")] = False,
     form: Form,
 ) -> None:
-    """Show the calibration, gaps, health and events of a recording, its notes and end; several files count as one.
+    """Show calibration, gaps, health, events, notes and end of a recording; several files count as one.
 
     Exit status: 0 pass; 1 fail (incomplete, rows lost, or contradictory); 2 wrong input; 3 inconclusive (the rig
     reported warnings, or bytes could not be checked). Doubts about channels do not change the verdict. With --quick
@@ -187,7 +187,7 @@ def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
 def _lost_rows(document: dict[str, Any]) -> list[str]:
     """Return descriptions of the losses; empty if there are none."""
     streams = document["streams"]
-    noted = bool(document["gaps"])  # missing rows without a noted gap are reported once
+    noted = bool(document["gaps"])  # without noted gaps, missing rows appear only in the lines per stream
     lost = sum(_lost(each) - (0 if noted else min(_lost(each), each["missing"])) for each in streams.values())
     declared = sum(each["declared"] for each in streams.values())
     losses = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or (document["gaps"] and not declared) else []
@@ -212,7 +212,7 @@ def _lost_at_ends(recording: Recording, key: str) -> int:
 
 
 def _number(value: float | None, noise: float) -> str:
-    """Return a value to the digit of its noise."""
+    """Return a value rounded to the digit of its noise."""
     if value is None:
         return ""
     digits = -math.floor(math.log10(abs(noise))) if noise else 0

@@ -51,7 +51,7 @@ _SPINNER = 2
 
 @dataclass(frozen=True)
 class Rotation:
-    """When a new file begins."""
+    """Limits of size and time at which a new file starts."""
 
     rotate_mb: Annotated[float | None, _files("Start a new file at about this size in MB: NAME.0000.mcap")] = None
     rotate_s: Annotated[float | None, _files("Start a new file after this simulated time in s")] = None

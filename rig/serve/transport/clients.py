@@ -17,12 +17,12 @@ from rig.serve.waiting import Deadline
 MAX_STATUS_CLIENTS = 64
 """Number of clients in the status."""
 MAX_CLIENTS = 4096
-"""Number of client names remembered; enough that invented names do not displace active clients."""
+"""Largest number of client names remembered; large, so that invented names do not displace active clients."""
 _RETENTION_S = 600.0
 _SILENCE_LIMIT_S = 3.0
 """Time without a report after which a client is no longer waited for [s]; clients report twice a second."""
 _SETTLING_S = 0.6
-"""Time without a lagging client before the cache may be dropped at the end of a run [s]: two heartbeats."""
+"""Time for which no client may lag at the end of a run before the cache is dropped [s]: two heartbeats."""
 _PROGRESS_LIMIT_S = 60.0
 """Time without progress after which a reporting client is no longer waited for, during a run [s]."""
 _PROGRESS_LIMIT_AT_END_S = 3.0
@@ -109,7 +109,7 @@ class Clients:
         self._lock = threading.Lock()
         self._reports: dict[_ClientKey, _LastReport] = {}
         self._first_rows: dict[_ClientKey, int] = {}
-        """Next row when a client without data was first seen: the reference for its lag."""
+        """Next row to be published when a client without data was first seen; its lag counts from this row."""
         self._swept_s = now_s()
         self.malformed = 0
         """Number of invalid reports."""

@@ -11,8 +11,7 @@ python-can's interface `slcan`. A line ends with a carriage return; the reply is
     M00000000 mFFFFFFFF  acceptance of all frames, the only one; Un: any speed of the terminal
 
 Frames are sent without a request: polling (P, A, X0) is not supported. The protocol has no error frames; they set
-status
-flags. It has no error state indicator either.
+status flags. It has no error state indicator either.
 """
 
 from __future__ import annotations

@@ -5,8 +5,7 @@ The protocol is that of the Linux daemon socketcand (github.com/linux-can/socket
 
 Supported: open, rawmode, bcmmode, controlmode, send, sendrtr, subscribe, unsubscribe, echo, statistics. Not supported,
 and refused with an error: cyclic sending (add, update, delete), content filters, ISO-TP and the settings of a bus.
-The
-beacon, a broadcast, is not sent. The protocol has no CAN FD frames: they are left out and counted.
+The beacon, a broadcast, is not sent. The protocol has no CAN FD frames: they are left out and counted.
 
 An error that is not one of the bus is sent as `< error 000 TIME TEXT >`: like an error frame without a class, because
 clients such as python-can's parse every error as a frame and fail at plain text.

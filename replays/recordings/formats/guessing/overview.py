@@ -55,7 +55,7 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
 
 
 def reduce_samples(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return minima and maxima of intervals in turn, which draw like all samples."""
+    """Return minimum and maximum of each interval, alternating; a line through them looks like all samples."""
     if len(values) <= 2 * _INTERVALS:
         return times, values
     starts = np.linspace(0, len(values), _INTERVALS, endpoint=False).astype(int)

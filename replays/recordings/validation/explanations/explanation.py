@@ -39,7 +39,7 @@ class Explanation:
         n: Number of samples in it.
         to_s: End of the window of the fit [s]; earlier than that of others if it was given up there.
         sure: Whether the remaining residual is negligible.
-        from_s: Begin of the change, if known [s].
+        from_s: Start of the change, if known [s].
     """
 
     kind: Kind

@@ -28,7 +28,7 @@ from rig.channels.table import Channel
 _TURN_TOLERANCE = 0.02
 """Largest deviation of two probes' signals from rotated ones."""
 _FADED_PART = 1e-3
-"""Tolerance of an AC-coupled channel's level, due to the begin of the fault between two rows."""
+"""Tolerance of an AC-coupled channel's level, due to the start of the fault between two rows."""
 _OUTLIER_NOISES = 6.0
 """Deviation of a sample, or of the mean of some, in noises, that is not noise."""
 PAIR_ROWS = 100
@@ -126,7 +126,7 @@ def find_others(
 
 
 def _find_onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end_s: float) -> float:
-    """Return the begin of a fault, after the settling of filters if enough rows remain [s]."""
+    """Return the start of a fault, after the settling of filters if enough rows remain [s]."""
     onsets = [end_s]
     for name, part in parts.items():
         rows = slice(part.rows_until(from_s), part.rows_until(end_s))

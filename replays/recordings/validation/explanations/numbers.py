@@ -1,4 +1,4 @@
-"""Explanation of a log's difference by single numbers of the model, in addition to its sensors."""
+"""Explanation of a log's difference by one model parameter at a time, in addition to its sensors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from replays.recordings.validation.trajectory import floors
 from rig.base.errors import InputError
 
 _SHORT_PART = 0.6
-"""Part of the time after the hammer pulse in which the search is repeated."""
+"""Fraction of the time after the hammer pulse to which a repeated search is limited."""
 
 
 def numbers_of_the_model(
@@ -32,17 +32,17 @@ def numbers_of_the_model(
     end_s: float,
     shorten: bool = True,
 ) -> list[Explanation]:
-    """Return the explanation by each number of the model, with all fitted numbers adjusted to it.
+    """Return an explanation for each model parameter that may cause the difference, with the fit readjusted to it.
 
-    The slopes at the fitted numbers are used: exact for small changes, and sufficient for correlations. If a fitted
-    number is outside its known uncertainty, only numbers that bring it back are returned.
+    The prediction is linearised about the fit: exact for small changes, and sufficient to show which parameters
+    correlate. If a fitted value is outside its prior uncertainty, only parameters that bring it back are returned.
 
     Args:
         parts: Recorded channels, on the model's clock.
         nominal: Prediction of the same rows.
         others: Equally valid predictions.
         tuned: Fit of the log.
-        rules: Candidates of the model.
+        rules: Candidate parameters of the model.
         end_s: Time up to which the model was compared [s].
         shorten: Whether to search again on a shorter part if nothing is found.
     """
@@ -95,14 +95,14 @@ def numbers_of_the_model(
         )  # fmt: skip
     hit_s = first_command_s(tuned.begun)
     if not found and shorten and hit_s < end_s:
-        # Every number moves the fitted ones out of their uncertainty: slopes over impacts are not valid.
+        # No candidate keeps the fitted values within their priors: across impacts the linearisation is not valid.
         sooner_s = hit_s + _SHORT_PART * (end_s - hit_s)
         return numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=sooner_s, shorten=False)
     return found
 
 
 def find_changes(experiment: Experiment, rules: Attribution, one: Explanation) -> dict[str, float]:
-    """Return the values of a number of the model by an explanation, by key."""
+    """Return the values that an explanation gives to the keys of its model parameter."""
     candidate = next(each for each in rules.candidates if each.name == one.name)
     _, sizes = _find_sizes(experiment, candidate)
     pairs = zip(candidate.keys, sizes, strict=True)
@@ -110,7 +110,7 @@ def find_changes(experiment: Experiment, rules: Attribution, one: Explanation) -
 
 
 def _find_sizes(experiment: Experiment, candidate: Candidate) -> tuple[bool, list[float]]:
-    """Return whether a number changes its values relatively, and the change of each per unit of it."""
+    """Return whether a candidate changes its keys in proportion, and the change of each key for a change of 1."""
     values = [value_of(experiment, key) for key in candidate.keys]
     relative = not (candidate.unit or 0.0 in values)
     return relative, values if relative else [1.0] * len(values)

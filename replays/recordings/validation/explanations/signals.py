@@ -35,7 +35,7 @@ class SignalFault(NamedTuple):
     Attributes:
         channel: Name of the channel, or "time" for all channels of a group.
         what: Name in the table of defects, as in `Law`.
-        from_s: Begin [s].
+        from_s: Start [s].
         to_s: End [s].
         text: Size and place.
     """

@@ -1,4 +1,4 @@
-"""The paper's figures, drawn with `as-printed` and `corrected` parameters and with the limits of the paper's axes."""
+"""The paper's figures for the parameter sets `as-printed` and `corrected`, with the last labels of the paper's axes."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def draw_magnets(one: Reproduction) -> Figure:
 
 
 def first_impacts(penetration: np.ndarray, times_ms: np.ndarray) -> tuple[float, float]:
-    """Return a time range [ms] from just before the first contact, short enough to resolve the houses' vibration.
+    """Return a time range [ms] from just before the first contact, short enough to resolve the housings' vibration.
 
     Args:
         penetration: Depth of contact [m], shape (n,).
@@ -178,7 +178,7 @@ def draw_hammer(found: dict[str, Reproduction]) -> Figure:
 
 @house_style()
 def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
-    """Draw figure 14: full spectrum over time, and that of the settled whirl with a resolution of 81.7 from 83.7 Hz."""
+    """Draw figure 14: full spectrum over time, and that of the settled whirl, which separates 81.7 from 83.7 Hz."""
     figure, columns = _columns(found, "Fig. 14: full spectrum at the disk", 7.4, heights=(1.2, 1.0))
     mesh: Any = None
     for one, (axes, lines) in columns:

@@ -110,9 +110,8 @@ def friction_swing(constants: Constants, spin: float) -> float:
     """Return the amplitude of the friction about its mean in a rolling whirl with moving houses [N].
 
     The houses are more compliant horizontally than vertically, so the ring's centre moves on an ellipse with half axes
-    X
-    and Y: a circle in the direction of whirl, and one of radius |X - Y|/2 against it. Relative to the shaft, the latter
-    rotates at twice the whirl frequency and accelerates and brakes it along the ring by m w^2 |X - Y| / 2.
+    X and Y: a circle in the direction of whirl, and one of radius |X - Y|/2 against it. Relative to the shaft, the
+    latter rotates at twice the whirl frequency and accelerates and brakes it along the ring by m w^2 |X - Y| / 2.
     """
     own = oscillator(constants)
     whirl, radius = rolling_circle(constants, spin)

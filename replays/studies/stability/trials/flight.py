@@ -1,4 +1,4 @@
-"""Trials without contact (T1, T5, T6): an undamped house mode, a hammer pulse, free flight of the whole rig."""
+"""Trials without contact (T1, T5, T6): an undamped mode of the housings, a hammer pulse, free flight of the rig."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _UNREACHED_CLEARANCE = 1e200
 
 
 def house_oscillator() -> tuple[Constants, Mode]:
-    """Return the rig at rest without contact or damping, and its stiffest house mode (vertical)."""
+    """Return the rig at rest without contact or damping, and the stiffest mode of its housings (vertical)."""
     constants = base_model(ModelLevels(magnet="linear", shaft="planar")).constants
     house = constants.house._replace(inner_beam_damping=0.0, outer_beam_damping=0.0, preload=1e7)
     # With the true preload of the transducers, a growing mode would unload them, soften and stay bounded.
@@ -35,7 +35,7 @@ def house_oscillator() -> tuple[Constants, Mode]:
 
 
 def house_energy(constants: Constants, states: np.ndarray) -> np.ndarray:
-    """Return the energy of the houses' vertical motion [J], shape (n,), from states or rows, shape (n, 14 or more)."""
+    """Return the energy of the housings' vertical motion [J], shape (n,); `states` has shape (n, 14 or more)."""
     house = constants.house
     inner, outer, inner_rate, outer_rate = (states[:, COLUMN[name]] for name in ("y_ih", "y_oh", "vy_ih", "vy_oh"))
     return 0.5 * (
@@ -47,7 +47,7 @@ def house_energy(constants: Constants, states: np.ndarray) -> np.ndarray:
 
 
 def _ring_down(engine: str, duration_s: float, hw: float = 0.0) -> float:
-    """Return E/E0 of the stiffest house mode, E averaged over the last 5 %; h w > 0 sets the step."""
+    """Return E/E0 of the housings' stiffest mode, E averaged over the last 5 %; h w > 0 sets the step."""
     constants, mode = house_oscillator()
     angular = 2.0 * math.pi * mode.frequency_hz
     step_s = hw / angular if hw else ENGINES[engine].step_us * 1e-6
@@ -59,7 +59,7 @@ def _ring_down(engine: str, duration_s: float, hw: float = 0.0) -> float:
         motion = move(engine, constants, quiet_inputs(tick_s=tick_s), y0, ticks=ticks, step=step, every=step)
         energy = house_energy(constants, motion.rows)
         window = max(1, len(energy) // 20)
-        # The initial state is at rest, where a first-order method's own energy equals the true one.
+        # It starts from rest, where the energy that a first-order method conserves equals the true energy.
         return float(np.mean(energy[-window:]) / energy[0])
 
 
@@ -76,8 +76,8 @@ def ring_down_cases(engine: str, quick: bool) -> Iterator[Cell]:
             boundless = math.isinf(limit)
             because = "no limit: exact flow, error control, or implicit" if boundless else ""
             because = because or f"h w = {hw:g} against its limit of {limit:.4g}"
-        # The test is for unlimited growth: near the limit energy varies by 1/(1 - h w/2), beyond it by powers of ten.
-        # Damping by a coarse step is shown in the atlas.
+        # Energy must not grow without limit: near the stability limit it varies by 1/(1 - h w/2), beyond it by powers
+        # of ten. Damping by a coarse step is shown in the atlas.
         yield Cell(f"step of h w = {hw:g}", growth, 100.0, because, expected)
 
 

@@ -55,7 +55,7 @@ CAN = (
 PERMISSIONS = (DOCUMENTS, STREAMS, PRESENCE, REPORTS, COMMANDS, TRUTH, *INSTRUMENTS, *CAN)
 
 PLAIN = "plain"
-"""Connections without TLS, which cannot be distinguished."""
+"""Role of all connections without TLS, which have no identity."""
 _VIEWER = (DOCUMENTS, STREAMS, PRESENCE)
 ROLES: Mapping[str, tuple[Permission, ...]] = {
     "operator": (*_VIEWER, REPORTS, COMMANDS),
