@@ -177,7 +177,7 @@ class Rig(Console):
             from drivers.sources.can_client import CanClient
 
             if truth:
-                raise InputError("truth", "left out over CAN: the bus does not carry it", list(truth))
+                raise InputError("truth", "left out over CAN, which cannot carry it", list(truth))
             client = CanClient(url.removeprefix("can:"), wait_s=wait_s)
             arguments |= {"name": f"CAN {client.node}", "source": client.source}
         else:
@@ -550,7 +550,6 @@ def connect(
 
         >>> connect("can:zenoh:can0", truth=["contact"])
         Traceback (most recent call last):
-        rig.base.errors.InputError: truth must be left out over CAN: the bus does not carry it; instead received
-            ['contact']
+        rig.base.errors.InputError: truth must be left out over CAN, which cannot carry it; instead received ['contact']
     """
     return Rig.open(url, channels=channels, wait_s=wait_s, **settings)

@@ -328,7 +328,7 @@ class Daq(RowReader, Closing):
                             return ready
                     await event.wait()
         except TimeoutError:
-            raise self._late(rows, timeout_s) from None
+            raise self._timeout_error(rows, timeout_s) from None
         finally:
             with self._changed:
                 self._wakers.discard(wake)

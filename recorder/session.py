@@ -15,7 +15,7 @@ from recorder.contents.metadata import Beginning
 from recorder.contents.summary import Progress, Summary
 from recorder.files.payload import Payload
 from recorder.output.captures import Captures, capture_path, check_captures
-from recorder.output.disk_limits import Limits
+from recorder.output.disk_limits import DiskLimits
 from recorder.output.series import Series, check_series, part_path
 from recorder.output.sink import Needs, Sink
 from recorder.output.trigger import Capture
@@ -106,7 +106,7 @@ class RecordingSession:
         history: bool = False,
         patience_s: float | None = None,
         force: bool = False,
-        limits: Limits | None = None,
+        limits: DiskLimits | None = None,
         capture: Capture | None = None,
         inbox_bytes: int = INBOX_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
@@ -140,7 +140,7 @@ class RecordingSession:
         patience_s = RETURN_S if patience_s is None else patience_s
         if not patience_s >= 0.0:
             raise InputError("patience_s", "at least 0", patience_s)
-        self._limits = limits or Limits()
+        self._limits = limits or DiskLimits()
         self._capture = capture
         if capture is None:
             check_series(path, self._limits, force=force)

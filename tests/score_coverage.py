@@ -26,7 +26,7 @@ import numpy as np
 from replays.estimate.sine import fit_sine, quality
 from replays.score.analogue import score_analogue
 from replays.score.card.scorecard import Scorecard
-from replays.score.records.recorded import Recorded, Table
+from replays.score.records.recorded import Recorded, RecordedTable
 from replays.score.records.sent import Session
 from replays.score.records.stimulus import Exact
 from replays.score.records.wiring import Wire
@@ -137,7 +137,7 @@ def _judged(
     """Return a scorecard's rows by quantity and channel, of a record whose signals are known by formulas."""
     t, names = np.arange(len(values[0])) / RATE_HZ, [each.name for each in CHANNELS[: len(values)]]
     columns = np.column_stack([t, *values])
-    table = Table(len(t), len(values), lambda wanted: [columns[:, [0, *(1 + n for n in wanted)]]])
+    table = RecordedTable(len(t), len(values), lambda wanted: [columns[:, [0, *(1 + n for n in wanted)]]])
     recorded = {name: Recorded(name, CHANNELS[0].unit, table, n, None) for n, name in enumerate(names)}
     wires = {name: Wire(name, 1, 1.0, (), False, late_s, (0.0, t[-1]), (), late_s) for name in names}
     sent = np.zeros(round((t[-1] + 0.1) * sent_hz))

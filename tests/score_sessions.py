@@ -12,7 +12,7 @@ import numpy as np
 import rig
 from recorder.writer import RecordingWriter
 from rig.base.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, sensor_key
-from rig.channels.generators import Source
+from rig.channels.generators import VoltageSource
 from rig.channels.table import Channel, ChannelTable, default_table
 from rig.run.scenes import Scene, load_scene, scene_document
 from tests.unit.recorder_stream import TICK_RATE_HZ, make_documents
@@ -91,7 +91,7 @@ class Sent:
     first: int
     rows: int
     counts: np.ndarray = field(init=False)
-    _sources: dict[str, Source] = field(init=False)
+    _sources: dict[str, VoltageSource] = field(init=False)
 
     def __post_init__(self) -> None:
         self._sources = make_scene(self.kind).sources() if self.generated else {}

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.can.message import CanMessage, MessageTable, Signal
+from drivers.can.message import CanMessage, CanSignal, MessageTable
 from drivers.can.signals import CONTROLLER, RIG, default_messages
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def _messages(rows: tuple[CanMessage, ...]) -> Iterator[str]:
     yield from (*multiplexed, "")
 
 
-def _format_signal(row: CanMessage, signal: Signal) -> str:
+def _format_signal(row: CanMessage, signal: CanSignal) -> str:
     selection = " M" if signal.selects else f" m{int(signal.selected_by[0])}" if signal.selected_by else ""
     low, high = (raw * signal.scale + signal.offset for raw in signal.raw_range)
     receiver = CONTROLLER if row.sender == RIG else RIG

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from drivers.can.message import KEY, CanMessage, Signal, checksum
+from drivers.can.message import KEY, CanMessage, CanSignal, checksum
 from rig.base.errors import InputError
 
 _DEVICE_NAME = re.compile(r"CAN (\d{1,3})")
@@ -60,27 +60,27 @@ class DeviceRequest:
 def device_messages(rig: str, controller: str, time: str) -> list[CanMessage]:
     """Return the messages, with the names of the two sending nodes and the label of a time."""
     join, done, leave = ((int(kind),) for kind in DeviceKind)
-    node = Signal("node", 8, 8, label="Number of the device, unique on the bus")
+    node = CanSignal("node", 8, 8, label="Number of the device, unique on the bus")
     return [
         CanMessage(
             "Device", 0x023, 8, False, math.inf, False, controller,
             "From a device under test to a rig in lockstep: a block waits until all joined devices have finished the "
             "previous one. Without counter, may be repeated; DeviceState replies to join and leave",
             (
-                Signal(
+                CanSignal(
                     "kind", 0, 8, label="Kind of message", selects=True,
                     choices={member.value: member.name.lower() for member in DeviceKind},
                 ),
                 node,
-                Signal(
+                CanSignal(
                     "patience", 16, 16, scale=_PATIENCE_STEP_S, unit="s", selected_by=join,
                     label="Longest wait of the rig for the device, wall time; 0: 10 s",
                 ),
-                Signal("reserved_join", 32, 16, label="Always 0", selected_by=join),
-                Signal("block", 16, 32, label="Number of the block that the device has finished", selected_by=done),
-                Signal("reserved", 16, 32, label="Always 0", selected_by=leave),
-                Signal("key", 48, 8, label=f"Always {KEY:#x}"),
-                Signal(
+                CanSignal("reserved_join", 32, 16, label="Always 0", selected_by=join),
+                CanSignal("block", 16, 32, label="Number of the block that the device has finished", selected_by=done),
+                CanSignal("reserved", 16, 32, label="Always 0", selected_by=leave),
+                CanSignal("key", 48, 8, label=f"Always {KEY:#x}"),
+                CanSignal(
                     "checksum", 56, 8,
                     label="CRC-8 (SAE J1850) over identifier, low byte first, and the other seven bytes",
                 ),
@@ -90,13 +90,13 @@ def device_messages(rig: str, controller: str, time: str) -> list[CanMessage]:
             "DeviceState", 0x024, 8, False, math.inf, False, rig,
             "Start or end of the rig's waiting for a device; lost: not finished in time, or another block",
             (
-                Signal("node", 0, 8, label="Number of the device"),
-                Signal(
+                CanSignal("node", 0, 8, label="Number of the device"),
+                CanSignal(
                     "state", 8, 8, label="State of the device",
                     choices={member.value: member.name.lower() for member in DeviceState},
                 ),
-                Signal("reserved", 16, 16, label="Always 0"),
-                Signal("time", 32, 32, unit="us", label=f"Time of the change. {time}"),
+                CanSignal("reserved", 16, 16, label="Always 0"),
+                CanSignal("time", 32, 32, unit="us", label=f"Time of the change. {time}"),
             ),
         ),
         CanMessage(
@@ -104,8 +104,8 @@ def device_messages(rig: str, controller: str, time: str) -> list[CanMessage]:
             "In lockstep with joined devices: end of a block, sent after all its frames. A command that "
             "was acknowledged before the last device is done takes effect at its end",
             (
-                Signal("block", 0, 32, label="Number of the block in this run, from 1"),
-                Signal("time", 32, 32, unit="us", label=f"End of the block. {time}"),
+                CanSignal("block", 0, 32, label="Number of the block in this run, from 1"),
+                CanSignal("time", 32, 32, unit="us", label=f"End of the block. {time}"),
             ),
         ),
     ]  # fmt: skip

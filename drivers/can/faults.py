@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any
 
-from drivers.can.message import CanMessage, Signal
+from drivers.can.message import CanMessage, CanSignal
 from rig.base.errors import InputError, UnknownNameError
 from rig.channels.faults import KINDS
 from rig.channels.table import ChannelTable
@@ -22,29 +22,29 @@ class FaultKind(IntEnum):
 _FAULT, _CLEAR = (int(FaultKind.FAULT),), (int(FaultKind.CLEAR),)
 
 
-def fault_signals(channels: ChannelTable) -> tuple[Signal, ...]:
+def fault_signals(channels: ChannelTable) -> tuple[CanSignal, ...]:
     """Return the signals of the first six bytes, except the counter."""
     main_numbers = ", ".join(f"{name}: {kind.main()}" for name, kind in KINDS.items() if kind.main())
     targets = [*channels.groups, *channels.channels]
     return (
-        Signal(
+        CanSignal(
             "kind", 0, 8, label="Kind of command", selects=True,
             choices={member.value: member.name.lower() for member in FaultKind},
         ),
-        Signal(
+        CanSignal(
             "fault", 16, 8, label=f"Kind of fault; main numbers: {main_numbers}", selected_by=_FAULT,
             choices=dict(sorted((kind.number, name) for name, kind in KINDS.items())),
         ),
-        Signal(
+        CanSignal(
             "target", 24, 8, label="Group or channel", selected_by=_FAULT, choices=dict(enumerate(targets, start=1))
         ),
-        Signal(
+        CanSignal(
             "number", 32, 12, signed=True, selected_by=_FAULT,
             label="Main number divided by 10^exponent; a channel by its target; 0: the default, if there is one",
         ),
-        Signal("exponent", 44, 4, signed=True, label="Exponent of ten", selected_by=_FAULT),
-        Signal("id", 16, 16, label="Number of the fault to end; 0: all", selected_by=_CLEAR),
-        Signal("reserved", 32, 16, label="Always 0", selected_by=_CLEAR),
+        CanSignal("exponent", 44, 4, signed=True, label="Exponent of ten", selected_by=_FAULT),
+        CanSignal("id", 16, 16, label="Number of the fault to end; 0: all", selected_by=_CLEAR),
+        CanSignal("reserved", 32, 16, label="Always 0", selected_by=_CLEAR),
     )  # fmt: skip
 
 

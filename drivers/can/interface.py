@@ -72,7 +72,7 @@ class ZenohBus(NodeBus):
         self.client.subscribe(
             codec.bus_key(self.channel),
             lambda _, payload: self._receive(payload),
-            on_miss=lambda _, count: self._missed(count),
+            on_miss=lambda _, count: self._count_missed(count),
         )
 
     def _describe_missing_hub(self) -> str:
@@ -118,13 +118,13 @@ class ZenohBus(NodeBus):
     def _watch(self, there: bool) -> None:
         """Handle the hub's token: the hub has stopped or restarted."""
         if not there:
-            self._lost()
+            self._on_hub_lost()
         elif not self._there and not self._is_shutdown:
             try:
                 self._join()
             except can.CanError:
                 # Another kind of hub, or stopped again: the bus stays without one, as its state and `send` report.
-                self._lost()
+                self._on_hub_lost()
 
     def _leave(self) -> None:
         self.client.close()
@@ -157,7 +157,7 @@ class HubBus(NodeBus):
         self.channel_info = f"{hub.channel} of this process"
 
     def _connect(self) -> None:
-        self.secret = self._hub.connect(self.name, self.receive, self._lost)
+        self.secret = self._hub.connect(self.name, self.receive, self._on_hub_lost)
 
     def _where(self) -> str:
         return f"the hub of CAN channel {self.channel} in this process"

@@ -18,7 +18,7 @@ ABSENT = -32768
 
 
 @dataclass(frozen=True, slots=True)
-class Signal:
+class CanSignal:
     """A number in a message.
 
     Attributes:
@@ -157,7 +157,7 @@ class CanMessage:
     periodic: bool
     sender: str
     label: str
-    signals: tuple[Signal, ...]
+    signals: tuple[CanSignal, ...]
     samples: SampleLayout | None = None
 
     def encode(self, **raw: int) -> bytes:
@@ -219,7 +219,7 @@ class MessageTable:
     @property
     def layout(self) -> int:
         """Fingerprint of the sample messages, 1 to 255, by which two sides detect different layouts."""
-        said = [
+        identity = [
             (
                 row.name,
                 row.identifier,
@@ -228,7 +228,7 @@ class MessageTable:
             )
             for row in (*self.fd, *self.classic)
         ]
-        return zlib.crc32(repr(said).encode()) % 255 + 1
+        return zlib.crc32(repr(identity).encode()) % 255 + 1
 
     @property
     def others(self) -> tuple[CanMessage, ...]:

@@ -28,7 +28,7 @@ from typing import Any
 from drivers.can.bus.frame import FD_LENGTHS
 from drivers.can.devices import DeviceRequest, device_messages, parse_device_frame
 from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signals
-from drivers.can.message import ABSENT, KEY, CanMessage, MessageTable, SampleLayout, Signal, checksum
+from drivers.can.message import ABSENT, KEY, CanMessage, CanSignal, MessageTable, SampleLayout, checksum
 from rig.base.errors import InputError
 from rig.channels.table import Channel, ChannelTable, default_table
 from rig.run.commands.table import COMMANDS
@@ -126,15 +126,15 @@ def _choices(names: type[IntEnum]) -> dict[int, str]:
 _TIME = "Simulated time, modulo 2^32 us (71.6 min)"
 
 _HEAD = (
-    Signal(
+    CanSignal(
         "counter", 8, 8, label=f"1 to {MAX_LEAD} more than that of the last command received by the rig, modulo 256"
     ),
-    Signal("key", 48, 8, label=f"Always {KEY:#x}"),
-    Signal("checksum", 56, 8, label="CRC-8 (SAE J1850) over identifier, low byte first, and the other seven bytes"),
+    CanSignal("key", 48, 8, label=f"Always {KEY:#x}"),
+    CanSignal("checksum", 56, 8, label="CRC-8 (SAE J1850) over identifier, low byte first, and the other seven bytes"),
 )
 _STOP_SIGNALS = (
-    Signal("kind", 0, 8, label="Kind of command", choices={int(CommandKind.STOP): "stop"}),
-    Signal("reserved", 16, 32, label="Always 0"),
+    CanSignal("kind", 0, 8, label="Kind of command", choices={int(CommandKind.STOP): "stop"}),
+    CanSignal("reserved", 16, 32, label="Always 0"),
     *_HEAD,
 )
 LIMITS = {
@@ -148,7 +148,7 @@ _VALUE_BITS = range(16, 48)
 """Bits of the fields in a command's frame."""
 
 
-def _field_signals() -> Iterator[Signal]:
+def _field_signals() -> Iterator[CanSignal]:
     """Yield the signals of each command's fields in order, and a reserved signal for the remaining bits."""
     bare = tuple(int(CommandKind[name.upper()]) for name, signals in _SIGNALS.items() if not signals)
     for name, signals in _SIGNALS.items():
@@ -156,15 +156,15 @@ def _field_signals() -> Iterator[Signal]:
         for field, each in signals.items():
             unit = each.unit or _COMMANDS[name][field].quantity.unit
             label = "{}, {:g} to {:g}".format(each.label, *LIMITS[field]) if field in LIMITS else each.label
-            yield Signal(each.name, start, each.bits, scale=each.scale, unit=unit, label=label, selected_by=kind)
+            yield CanSignal(each.name, start, each.bits, scale=each.scale, unit=unit, label=label, selected_by=kind)
             start += each.bits
         if signals and start < _VALUE_BITS.stop:
-            yield Signal(f"reserved_{name}", start, _VALUE_BITS.stop - start, label="Always 0", selected_by=kind)
-    yield Signal("reserved", _VALUE_BITS.start, len(_VALUE_BITS), label="Always 0", selected_by=bare)
+            yield CanSignal(f"reserved_{name}", start, _VALUE_BITS.stop - start, label="Always 0", selected_by=kind)
+    yield CanSignal("reserved", _VALUE_BITS.start, len(_VALUE_BITS), label="Always 0", selected_by=bare)
 
 
 _COMMAND_SIGNALS = (
-    Signal(
+    CanSignal(
         "kind", 0, 8, label="Kind of command", selects=True,
         choices={value: name for value, name in _choices(CommandKind).items() if value != CommandKind.STOP},
     ),
@@ -179,7 +179,7 @@ def _other_messages() -> list[CanMessage]:
         "The rig checks ranges and replies with the simulated time of effect (Acknowledge)"
     )
     shown = ", ".join(frame.shown for frame in _FRAMES.values() if frame.shown)
-    spin = Signal("spin", 8, 16, scale=0.001, unit="Hz", label="Spin speed of the shaft; 65.535: or more")
+    spin = CanSignal("spin", 8, 16, scale=0.001, unit="Hz", label="Spin speed of the shaft; 65.535: or more")
     return [
         CanMessage("Stop", 0x010, 8, False, 0.1, False, CONTROLLER, f"Ends the run. {command}", _STOP_SIGNALS),
         CanMessage("Command", 0x020, 8, False, 0.1, False, CONTROLLER, command, _COMMAND_SIGNALS),
@@ -187,71 +187,71 @@ def _other_messages() -> list[CanMessage]:
             "Acknowledge", 0x021, 8, False, 0.05, False, RIG,
             "Reply to a command; after a burst of 20, at most 50 refusals per second are acknowledged",
             (
-                Signal("counter", 0, 8, label="Counter of the command"),
-                Signal("result", 8, 4, label="Result of the command", choices=_choices(Result)),
-                Signal("field", 12, 4, label="Field that is out of range", choices=_choices(Field)),
-                Signal("time", 16, 32, unit="us", label=f"Time of effect if accepted, otherwise now. {_TIME}"),
-                Signal("limit", 48, 16, scale=0.1, label="Exceeded limit, or number of the new fault"),
+                CanSignal("counter", 0, 8, label="Counter of the command"),
+                CanSignal("result", 8, 4, label="Result of the command", choices=_choices(Result)),
+                CanSignal("field", 12, 4, label="Field that is out of range", choices=_choices(Field)),
+                CanSignal("time", 16, 32, unit="us", label=f"Time of effect if accepted, otherwise now. {_TIME}"),
+                CanSignal("limit", 48, 16, scale=0.1, label="Exceeded limit, or number of the new fault"),
             ),
         ),
         CanMessage(
             "Event", 0x310, 8, False, 0.1, False, RIG, "Event in the rig; sent after all earlier samples",
             (
-                Signal("event", 0, 8, label="Kind of event", choices=_choices(EventKind)),
-                Signal("number", 8, 8, label="Running number, modulo 256"),
-                Signal("time", 16, 32, unit="us", label=_TIME),
-                Signal("value", 48, 16, scale=0.1, label=shown[0].upper() + shown[1:]),
+                CanSignal("event", 0, 8, label="Kind of event", choices=_choices(EventKind)),
+                CanSignal("number", 8, 8, label="Running number, modulo 256"),
+                CanSignal("time", 16, 32, unit="us", label=_TIME),
+                CanSignal("value", 48, 16, scale=0.1, label=shown[0].upper() + shown[1:]),
             ),
         ),
         CanMessage(
             "Sync", 0x080, 8, False, 0.1, True, RIG,
             "Relates bus time to the stream: sent when the sample of this number is due, Rates.latency after its time",
             (
-                Signal("index", 0, 32, label="Number of the sample in the recording"),
-                Signal("time", 32, 32, unit="us", label=f"Time of the sample. {_TIME}"),
+                CanSignal("index", 0, 32, label="Number of the sample in the recording"),
+                CanSignal("time", 32, 32, unit="us", label=f"Time of the sample. {_TIME}"),
             ),
         ),
         CanMessage(
             "Keyphasor", 0x300, 8, False, 0.02, False, RIG,
             "Exact edge of the keyphasor (the bus load assumes at most 50 per second)",
             (
-                Signal("number", 0, 16, label="Number of the edge, modulo 65536"),
-                Signal("time", 16, 32, unit="us", label=f"Whole microseconds. {_TIME}"),
-                Signal("fraction", 48, 16, scale=1.0 / 65536, unit="us", label="Fraction of the time"),
+                CanSignal("number", 0, 16, label="Number of the edge, modulo 65536"),
+                CanSignal("time", 16, 32, unit="us", label=f"Whole microseconds. {_TIME}"),
+                CanSignal("fraction", 48, 16, scale=1.0 / 65536, unit="us", label="Fraction of the time"),
             ),
         ),
         CanMessage(
             "Clock", 0x6FF, 8, False, 1.0, True, RIG, "Whole seconds, to count wraps of time and index",
-            (Signal("seconds", 0, 32, unit="s", label="End of the last block, whole seconds of simulated time"),),
+            (CanSignal("seconds", 0, 32, unit="s", label="End of the last block, whole seconds of simulated time"),),
         ),
         CanMessage(
             "Status", 0x700, 8, False, 0.5, True, RIG, "Status of the rig; rig/status has all of it",
             (
-                Signal("state", 0, 4, label="State of the rig", choices=_choices(RigState)),
-                Signal("warnings", 4, 4, label="Number of warnings; 15: or more"),
+                CanSignal("state", 0, 4, label="State of the rig", choices=_choices(RigState)),
+                CanSignal("warnings", 4, 4, label="Number of warnings; 15: or more"),
                 spin,
-                Signal("lateness", 24, 16, scale=0.01, unit="ms", label="p99 of block lateness; 655.35: or more"),
-                Signal("dropped", 40, 12, label="Sample frames that were not sent, modulo 4096"),
-                Signal("refused", 52, 12, label="Commands refused, modulo 4096"),
+                CanSignal("lateness", 24, 16, scale=0.01, unit="ms", label="p99 of block lateness; 655.35: or more"),
+                CanSignal("dropped", 40, 12, label="Sample frames that were not sent, modulo 4096"),
+                CanSignal("refused", 52, 12, label="Commands refused, modulo 4096"),
             ),
         ),
         CanMessage(
             "Heartbeat", 0x701, 8, False, 1.0, True, RIG, "Sign of life; without it for 3 s the rig is lost",
             (
-                Signal("state", 0, 8, label="State of the rig", choices=_choices(RigState)),
-                Signal("beat", 8, 8, label="Running number, modulo 256"),
-                Signal("counter", 16, 8, label="Counter of the last received command; the next has one more"),
-                Signal("time", 24, 32, unit="us", label=f"End of the last block. {_TIME}"),
-                Signal("layout", 56, 8, label="Number of the sample layout; another number needs another DBC"),
+                CanSignal("state", 0, 8, label="State of the rig", choices=_choices(RigState)),
+                CanSignal("beat", 8, 8, label="Running number, modulo 256"),
+                CanSignal("counter", 16, 8, label="Counter of the last received command; the next has one more"),
+                CanSignal("time", 24, 32, unit="us", label=f"End of the last block. {_TIME}"),
+                CanSignal("layout", 56, 8, label="Number of the sample layout; another number needs another DBC"),
             ),
         ),
         CanMessage(
             "Rates", 0x702, 8, False, 1.0, True, RIG, "Decimation and latency of samples",
             (
-                Signal("rate", 0, 24, unit="Hz", label="Rate of the recording"),
-                Signal("fd_step", 24, 12, label="Decimation of samples in FD frames; 0: not sent"),
-                Signal("classic_step", 36, 12, label="Decimation of samples in classic frames"),
-                Signal("latency", 48, 16, scale=0.01, unit="ms", label="Time from a sample to its frame"),
+                CanSignal("rate", 0, 24, unit="Hz", label="Rate of the recording"),
+                CanSignal("fd_step", 24, 12, label="Decimation of samples in FD frames; 0: not sent"),
+                CanSignal("classic_step", 36, 12, label="Decimation of samples in classic frames"),
+                CanSignal("latency", 48, 16, scale=0.01, unit="ms", label="Time from a sample to its frame"),
             ),
         ),
     ]  # fmt: skip
@@ -264,9 +264,9 @@ def _decimation(channel: Channel) -> str:
     )
 
 
-def _sample_signals(samples: SampleLayout, index_label: str) -> tuple[Signal, ...]:
+def _sample_signals(samples: SampleLayout, index_label: str) -> tuple[CanSignal, ...]:
     width = 8 * samples.width
-    rows = [Signal("index", 0, 8 * samples.index_width, label=index_label)]
+    rows = [CanSignal("index", 0, 8 * samples.index_width, label=index_label)]
     for row in range(samples.rows):
         for column, channel in enumerate(samples.channels):
             start = 8 * samples.index_width + width * (row * len(samples.channels) + column)
@@ -274,7 +274,7 @@ def _sample_signals(samples: SampleLayout, index_label: str) -> tuple[Signal, ..
             scale = channel.scale * 2.0 ** int(samples.shifts[column])
             label = _decimation(channel) if row == 0 else ""
             rows.append(
-                Signal(name, start, width, True, scale, channel.offset, channel.unit, label, channel=channel)
+                CanSignal(name, start, width, True, scale, channel.offset, channel.unit, label, channel=channel)
             )  # fmt: skip
     return tuple(rows)
 
@@ -288,7 +288,7 @@ def _fault_message(table: ChannelTable) -> CanMessage:
 
 
 def _fd_messages(table: ChannelTable) -> list[CanMessage]:
-    found, taken = [], {row.name for row in _other_messages()}
+    found, used_names = [], {row.name for row in _other_messages()}
     parts = [
         (group, group.channels[first : first + _FD_CHANNELS])
         for group in table.groups.values()
@@ -304,7 +304,7 @@ def _fd_messages(table: ChannelTable) -> list[CanMessage]:
         rows = 60 // (3 * len(channels))
         samples = SampleLayout(channels, rows, 3, 4)
         name = group.name.capitalize()
-        if len(channels) < len(group.channels) or name in taken:
+        if len(channels) < len(group.channels) or name in used_names:
             name = f"{name}_{position}"
         label = (
             f"{group.title}: {rows} instants of counts as recorded. Every n-th sample of the {group.rate_hz} Hz stream "

@@ -167,12 +167,12 @@ class Protection:
         if not self._to_reset:
             return []
         self._to_reset = False
-        gone = [alarm for alarm in self.active if alarm != TRIP and not self._causes[alarm]]
-        if self.tripped and not any(kind in ("danger", "overspeed") for kind, _ in self.active.keys() - set(gone)):
-            gone.append(TRIP)
-        self.active = {alarm: action for alarm, action in self.active.items() if alarm not in gone}
+        cleared = [alarm for alarm in self.active if alarm != TRIP and not self._causes[alarm]]
+        if self.tripped and not any(kind in ("danger", "overspeed") for kind, _ in self.active.keys() - set(cleared)):
+            cleared.append(TRIP)
+        self.active = {alarm: action for alarm, action in self.active.items() if alarm not in cleared}
         self.first_out = [alarm for alarm in self.first_out if alarm in self.active]
-        return gone
+        return cleared
 
     def _states(self, signals: np.ndarray, first: int) -> dict[Alarm, tuple[np.ndarray, np.ndarray]]:
         """Return for each alarm whether it is on at each row, and its value there; in order of rank for one row."""
@@ -192,9 +192,9 @@ class Protection:
             for name, level, okay in zip(probes, levels, good, strict=True):
                 high = self.multiply * set_um
                 enabled = np.where(okay & armed & (name not in self.bypassed), level, -1.0)
-                above = self._above((kind, name), enabled, high, high * (1.0 - settings.hysteresis))
+                above = self._apply_hysteresis((kind, name), enabled, high, high * (1.0 - settings.hysteresis))
                 causes[kind, name] = self._run((kind, name), above) > self._rows(delay_s), level
-        if settings.timed:
+        if settings.uses_keyphasor:
             causes |= self._speed(signals[2], index, armed & (settings.keyphasor not in self.bypassed))
         self._causes = {alarm: bool(on[-1]) for alarm, (on, _) in causes.items()}
         states = {
@@ -202,7 +202,7 @@ class Protection:
             for alarm, (on, value) in causes.items()
         }
         trip = self._vote([states["danger", name][0] for name in probes], ~good) & armed
-        if settings.timed:
+        if settings.uses_keyphasor:
             trip |= states["overspeed", settings.keyphasor][0]
         states[TRIP] = np.logical_or.accumulate(trip) | self.tripped, levels.max(axis=0)
         return states
@@ -218,12 +218,12 @@ class Protection:
         rows = np.hstack([self._tail, probes - np.array(means)[:, 1:]])
         self._tail = rows[:, rows.shape[1] - self._window + 1 :]
         if self.settings.measure == "smax":
-            return np.tile(_sliding(np.fmax, np.hypot(*rows), self._window), (2, 1))
-        return _sliding(np.fmax, rows, self._window) - _sliding(np.fmin, rows, self._window)
+            return np.tile(_sliding_extreme(np.fmax, np.hypot(*rows), self._window), (2, 1))
+        return _sliding_extreme(np.fmax, rows, self._window) - _sliding_extreme(np.fmin, rows, self._window)
 
     def _speed(self, keyphasor: np.ndarray, index: np.ndarray, enabled: np.ndarray) -> dict[Alarm, tuple]:
         settings, before = self.settings, self._over["pulse", ""]
-        high = self._above(("pulse", ""), keyphasor, *_PULSE)
+        high = self._apply_hysteresis(("pulse", ""), keyphasor, *_PULSE)
         begins = [row for row in _changes(high, before) if high[row]]
         speed_hz, fast, pulse = (np.full(len(index), state) for state in (self._speed_hz, self._fast, self._pulse))
         for row in begins:
@@ -251,19 +251,19 @@ class Protection:
             return np.logical_and(*votes)
         return np.logical_and(*(votes | out)) & ~np.logical_and(*out)
 
-    def _run(self, what: Alarm, truth: np.ndarray) -> np.ndarray:
+    def _run(self, alarm: Alarm, truth: np.ndarray) -> np.ndarray:
         """Return the number of consecutive true rows that end at each row; continues from the previous call."""
         rows = np.arange(len(truth))
-        run = rows - np.maximum.accumulate(np.where(truth, -1 - self._runs.get(what, 0), rows))
-        self._runs[what] = int(run[-1])
+        run = rows - np.maximum.accumulate(np.where(truth, -1 - self._runs.get(alarm, 0), rows))
+        self._runs[alarm] = int(run[-1])
         return run
 
-    def _above(self, what: Alarm, values: np.ndarray, high: float, low: float) -> np.ndarray:
+    def _apply_hysteresis(self, alarm: Alarm, values: np.ndarray, high: float, low: float) -> np.ndarray:
         """Return for each row whether the value is above `high`, or was and has not fallen below `low` since."""
         outside = (values > high) | (values < low)
         last = np.maximum.accumulate(np.where(outside, np.arange(len(values)), -1))
-        above = np.where(last >= 0, values[last] > high, self._over.get(what, False))
-        self._over[what] = bool(above[-1])
+        above = np.where(last >= 0, values[last] > high, self._over.get(alarm, False))
+        self._over[alarm] = bool(above[-1])
         return above
 
 
@@ -272,7 +272,7 @@ def _changes(on: np.ndarray, before: bool) -> np.ndarray:
     return np.flatnonzero(np.diff(on, prepend=before))
 
 
-def _sliding(extreme: Callable[..., np.ndarray], values: np.ndarray, window: int) -> np.ndarray:
+def _sliding_extreme(extreme: Callable[..., np.ndarray], values: np.ndarray, window: int) -> np.ndarray:
     """Return the extreme over a sliding window, shape (..., values - window + 1). Each pass doubles the span."""
     span = 1
     while 2 * span <= window:

@@ -83,11 +83,11 @@ class Settings(Written):
         return self
 
     @property
-    def timed(self) -> bool:
+    def uses_keyphasor(self) -> bool:
         """Whether the monitor reads the keyphasor."""
         return self.overspeed_hz > 0.0 or self.speed_lost_s > 0.0
 
     @property
     def channels(self) -> list[str]:
         """Channels that the monitor reads."""
-        return [self.x, self.y, *([self.keyphasor] if self.timed else [])]
+        return [self.x, self.y, *([self.keyphasor] if self.uses_keyphasor else [])]

@@ -204,7 +204,7 @@ class RowReader:
         with self._changed:
             while (ready := self._take(rows, whole=whole)) is None:
                 if not self._wait(deadline):
-                    raise self._late(rows, timeout_s)
+                    raise self._timeout_error(rows, timeout_s)
             return ready
 
     def ready(self) -> Iterator[Samples]:
@@ -239,7 +239,7 @@ class RowReader:
         """Wait for more rows, and return False once the deadline has passed; the caller holds the lock."""
         return deadline.wait(self._changed)
 
-    def _late(self, rows: int | None, timeout_s: float) -> LinkTimeoutError:
+    def _timeout_error(self, rows: int | None, timeout_s: float) -> LinkTimeoutError:
         wanted = "any" if rows in (None, ALL_AVAILABLE) else rows
         return LinkTimeoutError(f"{self._reader_name}: {self._buffer.rows} of {wanted} rows came in {timeout_s:g} s")
 

@@ -166,29 +166,29 @@ class RigStream:
             assert validator is not None
             due, refused = validator.next.get(key, 0), validator.refused
             try:
-                taken = validator.take(key, payload)
+                accepted = validator.take(key, payload)
             except ValueError:
                 self.malformed += 1
                 return
             self.malformed += validator.refused - refused
-            if taken:
+            if accepted:
                 self._last_block_s = time.monotonic()
             if validator.next.get(key, 0) < due:
                 # The run has been replaced by another.
                 self._ends.pop(key, None)
             ending = self._ends.get(key)
             if ending is not None:
-                taken += validator.take_waiting({key: ending[0]}, key)
+                accepted += validator.take_waiting({key: ending[0]}, key)
             done = ending is not None and validator.next.get(key, 0) >= ending[0]
             if done:
                 del self._ends[key]
-        self._deliver(key, taken, ending[1] if done and ending else None)
+        self._deliver(key, accepted, ending[1] if done and ending else None)
 
-    def _deliver(self, key: str, taken: list[AcceptedBlock], reason: str | None) -> None:
+    def _deliver(self, key: str, accepted: list[AcceptedBlock], reason: str | None) -> None:
         with self._lock:
             listeners = list(self._listeners.get(key, ()))
         for listener in listeners:
-            for each in taken:
+            for each in accepted:
                 listener.on_block(each.block)
             if reason is not None:
                 listener.on_end(reason)
@@ -214,11 +214,11 @@ class RigStream:
                 with self._lock:
                     assert self._validator is not None
                     # Blocks and events arrive separately: the last blocks may still be in transit.
-                    taken, total = self._validator.take_waiting(rows, key), rows.get(key, 0)
+                    accepted, total = self._validator.take_waiting(rows, key), rows.get(key, 0)
                     done = self._validator.next.get(key, 0) >= total
                     if not done:
                         self._ends[key] = (total, reason)
-                self._deliver(key, taken, reason if done else None)
+                self._deliver(key, accepted, reason if done else None)
 
     def _end_in_silence(self, wait_s: float, reason: str) -> None:
         """End all streams after a silence of GRACE_S; check first after `wait_s`."""
@@ -257,5 +257,5 @@ class RigStream:
             with self._order:
                 with self._lock:
                     self._ends.pop(key, None)
-                    taken = self._validator.take_waiting(None, key) if self._validator is not None else []
-                self._deliver(key, taken, reason)
+                    accepted = self._validator.take_waiting(None, key) if self._validator is not None else []
+                self._deliver(key, accepted, reason)

@@ -73,7 +73,7 @@ class Parameters(_Document):
     values: dict[str, _Value]
 
 
-class Taken(_Document):
+class AcceptedCommand(_Document):
     """Command accepted by the rig."""
 
     id: Count
@@ -131,7 +131,7 @@ class Scene(_Document):
     name: str = ""
     seed: int | str = ""
     scene: _Fields | None = None
-    taken: tuple[Taken, ...] = ()
+    taken: tuple[AcceptedCommand, ...] = ()
     imported: _Import | None = Field(None, alias="import")
 
 
@@ -147,7 +147,7 @@ class Event(_Document):
     rows: dict[str, Count] | None = None
 
 
-class Command(Taken):
+class Command(AcceptedCommand):
     """Event of an accepted command."""
 
     event: Literal["command"]

@@ -17,7 +17,7 @@ from recorder.contents.counts import NS
 from recorder.contents.metadata import Beginning, Commands
 from recorder.files.payload import Payload
 from recorder.files.unfinished_file import find_files, remove
-from recorder.output.disk_limits import Limits, check_files
+from recorder.output.disk_limits import DiskLimits, check_files
 from recorder.output.sink import Needs, Sink
 from recorder.output.trigger import Capture, Crossings, Trigger
 from recorder.writer import RecordingError, RecordingWriter
@@ -41,7 +41,7 @@ def capture_path(path: Path, trigger: Trigger, number: int) -> Path:
     return path.with_name(f"{path.stem}.{trigger.name}-{number:03d}{path.suffix}")
 
 
-def check_captures(path: Path, capture: Capture, limits: Limits, *, force: bool = False) -> None:
+def check_captures(path: Path, capture: Capture, limits: DiskLimits, *, force: bool = False) -> None:
     """Refuse a name that cannot become the files of captures; see `check_files`."""
     names = {trigger.name: capture_path(path, trigger, 1) for trigger in capture.triggers}
     check_files(path, names.values(), _NUMBERED, limits, force=force)

@@ -24,7 +24,7 @@ _CHECK_S = 0.25
 
 
 @dataclass(frozen=True)
-class Limits:
+class DiskLimits:
     """Limits of file size and disk space; None or 0 for no limit.
 
     Attributes:
@@ -62,7 +62,7 @@ class Limits:
         return self.rotate_mb is not None or self.rotate_s is not None
 
 
-def check_files(path: Path, first: Iterable[Path], pattern: str, limits: Limits, *, force: bool) -> None:
+def check_files(path: Path, first: Iterable[Path], pattern: str, limits: DiskLimits, *, force: bool) -> None:
     """Refuse names that cannot become the files of a recording, without removing anything.
 
     Args:
@@ -104,7 +104,7 @@ class Room:
         finished_bytes: Size of the finished files [bytes].
     """
 
-    def __init__(self, folder: Path, limits: Limits, *, monotonic_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, folder: Path, limits: DiskLimits, *, monotonic_s: Callable[[], float] = time.monotonic) -> None:
         """Store the folder and its limits.
 
         Args:

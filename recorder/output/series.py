@@ -17,7 +17,7 @@ from recorder.contents.counts import NS, Counts
 from recorder.contents.metadata import Beginning
 from recorder.files.payload import Payload
 from recorder.files.unfinished_file import find_files, remove
-from recorder.output.disk_limits import MB, Limits, check_files
+from recorder.output.disk_limits import MB, DiskLimits, check_files
 from recorder.output.sink import Needs, Sink
 from recorder.writer import RecordingError, RecordingWriter
 from rig.base.errors import InputError
@@ -38,7 +38,7 @@ def part_path(path: Path, number: int) -> Path:
     return path.with_name(f"{path.stem}.{number:04d}{path.suffix}")
 
 
-def check_series(path: Path, limits: Limits, *, force: bool = False) -> None:
+def check_series(path: Path, limits: DiskLimits, *, force: bool = False) -> None:
     """Refuse names that cannot become the files of a recording; see `check_files`."""
     rotates = limits.rotates
     check_files(path, [part_path(path, 0) if rotates else path], _NUMBER if rotates else "", limits, force=force)

@@ -12,7 +12,7 @@ from typing import Any
 from recorder.contents.counts import Counts, Tally
 from recorder.contents.metadata import Beginning, Commands
 from recorder.files.payload import Payload
-from recorder.output.disk_limits import Limits, Room
+from recorder.output.disk_limits import DiskLimits, Room
 from recorder.writer import RecordingWriter
 from rig.channels.table import ChannelTable
 
@@ -38,7 +38,7 @@ class Needs:
     tick_rate_hz: int
     scene: dict[str, Any]
     open_file: OpenFile
-    limits: Limits
+    limits: DiskLimits
     force: bool = False
     monotonic_s: Callable[[], float] = time.monotonic
 

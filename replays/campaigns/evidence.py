@@ -174,11 +174,11 @@ class Trial:
         span = recording.span_s or (0.0, 0.0)
         about = next((each.at_s + self.origin_s for each in failed if each.at_s is not None), span[1])
         from_s, to_s = max(span[0], about - EVENT_MARGIN_S), min(span[1] + 1e-3, about + EVENT_MARGIN_S)
-        made, picture = folder / "event.mcap", folder / "event.png"
-        cut(recording, made, from_s=from_s, to_s=to_s, force=True)
+        clip, picture = folder / "event.mcap", folder / "event.png"
+        cut(recording, clip, from_s=from_s, to_s=to_s, force=True)
         channels = dict.fromkeys(name for each in failed for name in each.channels)
-        draw(Recording.open(made), picture, failed, origin_s=self.origin_s, channels=list(channels), about_s=about)
-        return [made, picture]
+        draw(Recording.open(clip), picture, failed, origin_s=self.origin_s, channels=list(channels), about_s=about)
+        return [clip, picture]
 
     def document(self) -> dict[str, Any]:
         """Return the test's data for the report, in basic types only."""

@@ -52,7 +52,7 @@ class Must:
             raise InputError(field, "from the lower number to the higher", text)
         return cls("between", (float(low), float(high)), unit or "1")
 
-    def within(self, unit: str, *, field: str, of: str) -> Must:
+    def convert_to(self, unit: str, *, field: str, of: str) -> Must:
         """Return the limit in the unit of the measured value.
 
         Args:
@@ -226,5 +226,5 @@ def judge_value(
         raise InputError("limit", must, Words(f"{limit!r}, and a value of {value!r}")) from None
     if isinstance(numbers, tuple) and (len(numbers) != 2 or not numbers[0] <= numbers[1]):
         raise InputError("limit", "two numbers, the lower first", limit)
-    must = Must(op, numbers, unit_of_limit or unit).within(unit or "1", field="unit_of_limit", of=name)  # type: ignore[arg-type]
+    must = Must(op, numbers, unit_of_limit or unit).convert_to(unit or "1", field="unit_of_limit", of=name)  # type: ignore[arg-type]
     return Measurement(name, value, must, **fields)

@@ -88,7 +88,7 @@ class CampaignItem(pytest.Item):
 
     def setup(self) -> None:
         """Create the trial of the case."""
-        self.stash[_TRIAL] = _trial_of(self)
+        self.stash[_TRIAL] = _get_trial(self)
 
     def runtest(self) -> None:
         """Run the case."""
@@ -159,7 +159,7 @@ def pytest_report_teststatus(report: pytest.TestReport | pytest.CollectReport) -
     return ("error", "I", "INCONCLUSIVE") if getattr(report, "rig_inconclusive", False) else None
 
 
-def _trial_of(item: pytest.Item) -> Trial:
+def _get_trial(item: pytest.Item) -> Trial:
     from replays.campaigns.equipment.bench import Target
     from replays.campaigns.evidence import Trial
 
@@ -173,7 +173,7 @@ def _trial_of(item: pytest.Item) -> Trial:
 def rig_trial(request: pytest.FixtureRequest) -> Iterator[Trial]:
     """Provide the state that the other fixtures share; end all processes afterwards."""
     item = request.node
-    trial = item.stash[_TRIAL] = _trial_of(item)
+    trial = item.stash[_TRIAL] = _get_trial(item)
     yield trial
     trial.close(failed=item.stash.get(_FAILED, False))
 
@@ -186,11 +186,11 @@ def bench(request: pytest.FixtureRequest, rig_trial: Trial) -> Bench:
 
     marker = request.node.get_closest_marker("bench")
     try:
-        made = rig_trial.start_bench(read_settings({} if marker is None else marker.kwargs))
+        started = rig_trial.start_bench(read_settings({} if marker is None else marker.kwargs))
     except UnsupportedError as error:
         pytest.skip(str(error))
-    made.begin()
-    return made
+    started.begin()
+    return started
 
 
 @pytest.fixture
@@ -206,9 +206,9 @@ def dut(bench: Bench, rig_trial: Trial, request: pytest.FixtureRequest) -> Calla
 @pytest.fixture
 def record(bench: Bench, rig_trial: Trial) -> Record:
     """Record the bench from the start of the test; `record.stop()` returns the recording."""
-    made = rig_trial.start_record()
-    made.wait_until_connected()  # otherwise its connection would count as that of a device
-    return made
+    started = rig_trial.start_record()
+    started.wait_until_connected()  # otherwise its connection would count as that of a device
+    return started
 
 
 @pytest.fixture
@@ -223,10 +223,10 @@ def measure(request: pytest.FixtureRequest, rig_trial: Trial) -> Callable[..., f
         from replays.campaigns.measurement import judge_value
 
         fields = {"source": source, "resolution": rig_trial.resolution, "at_s": at_s, "channels": tuple(channels)}
-        made = rig_trial.take(judge_value(name, value, unit, op, limit, unit_of_limit=unit_of_limit, **fields))
-        request.node.user_properties.extend(made.properties())
-        if made.outcome is Outcome.FAIL:
-            raise rig_trial.failed(made.line)
+        measurement = rig_trial.take(judge_value(name, value, unit, op, limit, unit_of_limit=unit_of_limit, **fields))
+        request.node.user_properties.extend(measurement.properties())
+        if measurement.outcome is Outcome.FAIL:
+            raise rig_trial.failed(measurement.line)
         return value
 
     return hold

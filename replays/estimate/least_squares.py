@@ -67,10 +67,10 @@ def inverse_square(matrix: np.ndarray) -> np.ndarray:
     """Return (matrix^T matrix)^-1, the covariance of a linear fit for unit noise, shape (k, k); 0 if undetermined."""
     sizes = column_sizes(matrix)
     scaled = matrix / sizes
-    return inverse_of(scaled.T @ scaled) / np.outer(sizes, sizes)
+    return compute_inverse(scaled.T @ scaled) / np.outer(sizes, sizes)
 
 
-def inverse_of(square: np.ndarray) -> np.ndarray:
+def compute_inverse(square: np.ndarray) -> np.ndarray:
     """Return the inverse of normal equations, shape (k, k); 0 in directions that they do not determine."""
     return np.linalg.pinv(square)
 

@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 
 
-def true_runs(rows: np.ndarray) -> list[tuple[int, int]]:
+def find_true_runs(rows: np.ndarray) -> list[tuple[int, int]]:
     """Return begin and end (exclusive) of each run of true elements of `rows`, shape (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(np.int8)))
     return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
 
 
-def split_at(breaks: np.ndarray) -> list[tuple[int, int]]:
+def split_at_breaks(breaks: np.ndarray) -> list[tuple[int, int]]:
     """Return begin and end (exclusive) of the pieces of rows between breaks.
 
     Args:

@@ -45,11 +45,11 @@ class Spectrum(NamedTuple):
     rows: int
 
     @classmethod
-    def of(cls, values: np.ndarray, step_s: float) -> Spectrum:
+    def from_samples(cls, values: np.ndarray, step_s: float) -> Spectrum:
         """Compute the spectrum of evenly spaced samples, shape (n,)."""
         return cls(spectrum(values), 2j * np.pi * np.fft.rfftfreq(len(values), step_s), len(values))
 
-    def through(self, response: np.ndarray | float) -> np.ndarray:
+    def apply_response(self, response: np.ndarray | float) -> np.ndarray:
         """Return the signal filtered with a response at each line, shape (rows,)."""
         return np.fft.irfft(self.lines * response, self.rows)
 

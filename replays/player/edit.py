@@ -56,7 +56,7 @@ class Edit:
         for key in after:
             if after.count(key) > 1:
                 raise InputError("remap", "to a key that nothing else has", key)
-        self.catalogue = self._edited(catalogue, table, channels, dict(names or {}))
+        self.catalogue = self._apply_edits(catalogue, table, channels, dict(names or {}))
         """Catalogue that matches the published payloads."""
 
     @property
@@ -77,7 +77,7 @@ class Edit:
             return block
         return replace(block, values=block.values[:, columns])
 
-    def _edited(
+    def _apply_edits(
         self, catalogue: dict[str, Any], table: ChannelTable, channels: Sequence[str] | None, names: dict[str, str]
     ) -> dict[str, Any]:
         for name in [*(channels or ()), *names]:

@@ -122,6 +122,6 @@ def _is_block(item: Item) -> bool:
     return item.block is not None and item.key != wire.EDGES
 
 
-def size_of(read: Batch | Mark) -> int:
+def payload_size(read: Batch | Mark) -> int:
     """Return the payload size of a batch or mark [bytes]."""
     return sum(len(item.payload) for item in read) if isinstance(read, list) else 0

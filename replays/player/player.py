@@ -16,7 +16,7 @@ from typing import Any
 from replays.player.edit import Edit
 from replays.player.messages import Track
 from replays.player.outlet import Outlet
-from replays.player.play_range import Mark, Part, Passes, has_block, size_of
+from replays.player.play_range import Mark, Part, Passes, has_block, payload_size
 from replays.player.playhead import NS, Playhead
 from replays.player.readahead import ReadAhead
 from replays.player.timeline import Batch, By, Timeline
@@ -43,7 +43,7 @@ _MAX_STEP_S = 3600
 
 
 @dataclass(slots=True)
-class _Step:
+class _PlayStep:
     """A step in progress: until an instant [ns of the replay], or for a number of blocks."""
 
     reply: PendingCommand
@@ -120,7 +120,7 @@ class Player(ServedRun):
         self._awaited = wait_for
         """Number of clients to wait for; 0 if only a command ends the pause."""
         self._wait_s = wait_s
-        self._step: _Step | None = None
+        self._step: _PlayStep | None = None
         self._held: tuple[str, float] | None = None
         """Client that limits a burst, and the time since when it does [s, monotonic]."""
         self._pending_warnings: deque[str] = deque()
@@ -308,7 +308,7 @@ class Player(ServedRun):
         if self._ahead is not None:
             self._ahead.close()
         self._head = None
-        self._ahead = ReadAhead(self._passes.play(from_ns, self._pass), size=size_of)
+        self._ahead = ReadAhead(self._passes.play(from_ns, self._pass), size=payload_size)
         return self._ahead
 
     def _begin(self, mark: Mark) -> None:
@@ -391,14 +391,14 @@ class Player(ServedRun):
             if value is not None and value > most:
                 raise InputError(name, f"a whole number of 1 to {most}", value)
         if arguments.ticks is not None and arguments.blocks is None:
-            self._step = _Step(pending, until_ns=self._now_ns() + arguments.ticks * NS // self._rate)
+            self._step = _PlayStep(pending, until_ns=self._now_ns() + arguments.ticks * NS // self._rate)
         elif arguments.blocks is not None and arguments.ticks is None:
-            self._step = _Step(pending, blocks=arguments.blocks)
+            self._step = _PlayStep(pending, blocks=arguments.blocks)
         else:
             raise InputError("step", "either ticks or blocks", sorted(pending.request))
         self._playhead.start()
 
-    def _end_step(self, step: _Step, at_ns: int) -> None:
+    def _end_step(self, step: _PlayStep, at_ns: int) -> None:
         self._step = None
         self._playhead.play_ns = at_ns
         self._playhead.hold(at_ns)

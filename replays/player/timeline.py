@@ -71,7 +71,7 @@ class Timeline:
             to_ns: Latest end of a block or time of a document [ns of simulated time]; None: no limit.
         """
         batch: Batch = []
-        for item in self._in_order(from_ns, to_ns):
+        for item in self._read_in_order(from_ns, to_ns):
             if batch and item.due_ns != batch[0].due_ns:
                 yield batch
                 batch = []
@@ -79,7 +79,7 @@ class Timeline:
         if batch:
             yield batch
 
-    def _in_order(self, from_ns: int, to_ns: int | None) -> Iterator[Item]:
+    def _read_in_order(self, from_ns: int, to_ns: int | None) -> Iterator[Item]:
         chunks = self.track.chunks
         # Earliest begin of a message in each chunk and all chunks after it.
         beginnings = list(accumulate((chunk.begin_ns for chunk in reversed(chunks)), min))[::-1]
@@ -95,7 +95,7 @@ class Timeline:
                 while waiting and waiting[0][0] <= beginning_ns:
                     yield heapq.heappop(waiting)[2]
             for message in self.track.read(chunk):
-                item = deadlines.item(message)
+                item = deadlines.make_item(message)
                 if message.time_ns < from_ns or (to_ns is not None and item.position_ns > to_ns):
                     continue
                 if self.by is By.ARRIVAL:
@@ -116,7 +116,7 @@ class _Deadlines:
         self._arrived_ns = 0
         self._length_ns = 0
 
-    def item(self, message: Message) -> Item:
+    def make_item(self, message: Message) -> Item:
         block, key = _block(message), message.key
         position_ns = message.time_ns
         if block is not None and block.rate_hz > 0.0:

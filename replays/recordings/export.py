@@ -58,7 +58,7 @@ def check_run_output(path: Path, *, force: bool) -> None:
     check_output(path, force=force, suffixes=SUFFIXES)
 
 
-def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> RunWriter:
+def make_writer(path: Path, simulation: Simulation, *, force: bool = False) -> RunWriter:
     """Return the writer for the suffix of a path."""
     check_run_output(path, force=force)
     if path.suffix == ".mcap":
@@ -95,7 +95,7 @@ def write_run(
         ...     path.stat().st_size > 100_000
         True
     """
-    with writer_for(path, simulation, force=force) as writer:
+    with make_writer(path, simulation, force=force) as writer:
         for frame in frames(simulation):
             writer.write(frame)
             progress(simulation.tick / simulation.end_tick)

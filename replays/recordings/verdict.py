@@ -74,7 +74,7 @@ def judge(recording: Recording) -> Verdict:
         *_law_rows(figures),
         _orbit_row(recording, figures),
         *_paper_rows(figures, before_hz=before_hz),
-        _stated("reaction N/S, whirl", f"{figures.reaction_y_n:.0f} N"),
+        _fact("reaction N/S, whirl", f"{figures.reaction_y_n:.0f} N"),
         _impact_row(recording, hammer_s),
         _spin_row(figures, before_hz=before_hz, lowest_hz=float(after.min())),
         *stream_rows(recording),
@@ -89,20 +89,20 @@ def stream_rows(recording: Recording) -> list[VerdictRow]:
     lost = sum(stream.lost for stream in streams.values())
     count = sum(stream.rows for key, stream in streams.items() if "/sensors/" in key)
     rows = [
-        _judged("samples lost", f"{lost} of {count} rows", "0", lost == 0 and not recording.gaps),
-        _judged("recording", recording.end_reason, "complete", recording.complete),
+        _judge("samples lost", f"{lost} of {count} rows", "0", lost == 0 and not recording.gaps),
+        _judge("recording", recording.end_reason, "complete", recording.complete),
     ]
     if recording.last_status is not None:
         rows += _status_rows(recording.last_status)
     return rows
 
 
-def _judged(quantity: str, measured: str, expected: str, good: bool) -> VerdictRow:
+def _judge(quantity: str, measured: str, expected: str, good: bool) -> VerdictRow:
     # `is False` fails for numpy booleans.
     return VerdictRow(quantity, measured, expected, bool(good))
 
 
-def _stated(quantity: str, measured: str, comparison: str = "") -> VerdictRow:
+def _fact(quantity: str, measured: str, comparison: str = "") -> VerdictRow:
     """Return a line without a verdict, with a value for comparison."""
     return VerdictRow(quantity, measured, comparison, None)
 
@@ -119,9 +119,9 @@ def _law_rows(figures: WhirlFigures) -> list[VerdictRow]:
     disk_law = f"{law_hz:.3f} Hz, within 0.2 %"
     sense = "backward" if whirl_hz < 0 else "forward"
     return [
-        _judged("whirl frequency, ring probes", ring_hz, law, _is_close(whirl_hz, law_hz, within=2e-3)),
-        _judged("whirl frequency, disk probes", f"{disk_hz:.3f} Hz", disk_law, _is_close(disk_hz, law_hz, within=2e-3)),
-        _judged("sense of rotation", sense, "backward", whirl_hz < 0),
+        _judge("whirl frequency, ring probes", ring_hz, law, _is_close(whirl_hz, law_hz, within=2e-3)),
+        _judge("whirl frequency, disk probes", f"{disk_hz:.3f} Hz", disk_law, _is_close(disk_hz, law_hz, within=2e-3)),
+        _judge("sense of rotation", sense, "backward", whirl_hz < 0),
     ]
 
 
@@ -132,14 +132,14 @@ def _orbit_row(recording: Recording, figures: WhirlFigures) -> VerdictRow:
     hertz_m = (force_n / parameter_si(recording, "contact.stiffness")) ** (2 / 3)
     orbit = f"{figures.radius_m * 1e3:.4f} mm = r0 {delta_m * 1e6:+.1f} µm"
     hertz = f"r0 {hertz_m * 1e6:+.1f} µm, Hertz at {force_n:.0f} N, within 15 %"
-    return _judged("orbit in the ring", orbit, hertz, _is_close(delta_m, hertz_m, within=0.15))
+    return _judge("orbit in the ring", orbit, hertz, _is_close(delta_m, hertz_m, within=0.15))
 
 
 def _paper_rows(figures: WhirlFigures, *, before_hz: float) -> list[VerdictRow]:
     """Return the lines that compare the whirl with the paper's figures, which hold only at its speed."""
     reaction = f"{figures.reaction_x_n:.0f} N"
     if not abs(before_hz - PAPER_SPIN_HZ) < 0.05:
-        return [_stated("reaction E/W, whirl", reaction)]
+        return [_fact("reaction E/W, whirl", reaction)]
     whirl_hz, spin_hz = figures.frequency_hz, figures.spin_hz
     scaled_hz = whirl_hz / spin_hz * PAPER_SPIN_HZ
     paper_hz = -PAPER_WHIRL_HZ
@@ -149,9 +149,9 @@ def _paper_rows(figures: WhirlFigures, *, before_hz: float) -> list[VerdictRow]:
     at_its_spin = f"{paper_hz} Hz, within 1.5 % (reduced here by delta)"
     comparison = "the paper: +-500 N measured, 0-900 N axis of its simulation (Figs. 15, 16)"
     return [
-        _judged("against the paper's Fig. 14", whirl, as_is, _is_close(whirl_hz, paper_hz, within=0.03)),
-        _judged("  the same at 6.2 Hz spin", scaled, at_its_spin, _is_close(scaled_hz, paper_hz, within=0.015)),
-        _stated("reaction E/W, whirl", reaction, comparison),
+        _judge("against the paper's Fig. 14", whirl, as_is, _is_close(whirl_hz, paper_hz, within=0.03)),
+        _judge("  the same at 6.2 Hz spin", scaled, at_its_spin, _is_close(scaled_hz, paper_hz, within=0.015)),
+        _fact("reaction E/W, whirl", reaction, comparison),
     ]
 
 
@@ -160,13 +160,13 @@ def _impact_row(recording: Recording, hammer_s: float) -> VerdictRow:
     forces = recording.samples("forces")
     after = forces.times_s >= hammer_s
     largest = " / ".join(f"{np.abs(pair[after]).max():.0f} N" for pair in reactions(forces))
-    return _stated("largest reactions E/W / N/S", largest, "the paper: +-5000 N, axes of its simulation (Fig. 15)")
+    return _fact("largest reactions E/W / N/S", largest, "the paper: +-5000 N, axes of its simulation (Fig. 15)")
 
 
 def _spin_row(figures: WhirlFigures, *, before_hz: float, lowest_hz: float) -> VerdictRow:
     """Return the line on the spin, which dips at the impacts."""
     spin = f"{before_hz:.3f} / {lowest_hz:.3f} / {figures.spin_hz:.3f} Hz"
-    return _judged("spin: before, lowest, settled", spin, "dips, and recovers in part", lowest_hz < before_hz - 0.05)
+    return _judge("spin: before, lowest, settled", spin, "dips, and recovers in part", lowest_hz < before_hz - 0.05)
 
 
 def _status_rows(status: dict[str, Any]) -> list[VerdictRow]:
@@ -177,16 +177,16 @@ def _status_rows(status: dict[str, Any]) -> list[VerdictRow]:
     ledger = f"{residual_j:.1e} J of {dissipated_j:.2f} J"
     alarm = status["energy"].get("alarm_share", 1e-3)  # default of older recordings
     closed = abs(residual_j) < alarm * max(dissipated_j, 1e-6)
-    rows = [_judged("energy residual", ledger, f"below {alarm:g} of the dissipated energy", closed)]
+    rows = [_judge("energy residual", ledger, f"below {alarm:g} of the dissipated energy", closed)]
     if "lateness_ms" not in status:
         return rows
     late, block_ms, factor = status["lateness_ms"], status["block_ms"], status["real_time_factor"]
     lateness = f"{late['p50']:.3f} / {late['p99']:.3f} / {late['max']:.3f} ms"
-    paced = _judged("real-time factor", f"{factor:.4f}", "1.000", abs(factor - 1.0) < 2e-3)
+    paced = _judge("real-time factor", f"{factor:.4f}", "1.000", abs(factor - 1.0) < 2e-3)
     if _is_late(status) and factor < 1.0:  # real time was not possible
-        paced = _stated(paced.quantity, paced.measured, paced.expected)
+        paced = _fact(paced.quantity, paced.measured, paced.expected)
     expected = f"p99 below a block of {block_ms:g} ms, if the machine is idle"
-    return [_stated("lateness p50 / p99 / max", lateness, expected), paced, *rows]
+    return [_fact("lateness p50 / p99 / max", lateness, expected), paced, *rows]
 
 
 def _is_late(status: dict[str, Any]) -> bool:

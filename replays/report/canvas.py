@@ -124,12 +124,12 @@ def draw_signals(axes: Any, times: np.ndarray, *signals: tuple[np.ndarray, str, 
         axes.plot(middle, folded.mean(axis=1), color=colour, lw=1.4, label=label)
 
 
-def label_of(name: str, unit: str) -> str:
+def axis_label(name: str, unit: str) -> str:
     """Return the axis label of a channel."""
     return f"{name} [{unit.replace('^2', '²')}]"
 
 
-def legend_below(figure: Figure, *panels: Any, columns: int = 4) -> None:
+def add_legend(figure: Figure, *panels: Any, columns: int = 4) -> None:
     """Draw one legend for some panels, or all, below the figure; each name occurs once."""
     found = {}
     for axes in panels or figure.axes:

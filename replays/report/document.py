@@ -37,7 +37,7 @@ def fragments(text: str) -> list[tuple[str, Style]]:
     return found
 
 
-def unset(text: str) -> str:
+def strip_styles(text: str) -> str:
     """Return a text without styles: backticks are removed, subscripts follow an underscore, superscripts a caret."""
     return "".join({"sub": "_", "sup": "^"}.get(style, "") + piece for piece, style in fragments(text))
 

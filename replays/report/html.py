@@ -27,7 +27,7 @@ def render(report: Report) -> bytes:
     return page.encode()
 
 
-def _marked(text: str) -> Markup:
+def _to_markup(text: str) -> Markup:
     """Return a text as markup with code, subscripts and superscripts."""
     from markupsafe import Markup, escape
 
@@ -54,5 +54,5 @@ def _template() -> jinja2.Template:
         keep_trailing_newline=True,
     )
     environment.filters["base64"] = _base64
-    environment.filters["marked"] = _marked
+    environment.filters["marked"] = _to_markup
     return environment.from_string(files("replays.report").joinpath("page.html").read_text(encoding="utf-8"))

@@ -16,7 +16,7 @@ Outcome = Literal["passed", "failure", "error", "inconclusive", "skipped"]
 
 
 @dataclass(frozen=True)
-class Case:
+class JunitCase:
     """A test case.
 
     Attributes:
@@ -48,7 +48,7 @@ class Suite:
     """
 
     name: str
-    cases: Sequence[Case]
+    cases: Sequence[JunitCase]
     properties: Sequence[tuple[str, str]] = ()
     timestamp: str = ""
 
@@ -87,7 +87,7 @@ def write_junit(path: Path, suites: Sequence[Suite], *, name: str = "") -> None:
         ElementTree(root).write(draft, encoding="utf-8", xml_declaration=True)
 
 
-def _counts(cases: Sequence[Case]) -> dict[str, str]:
+def _counts(cases: Sequence[JunitCase]) -> dict[str, str]:
     found = Counter(case.outcome for case in cases)
     errors = found["error"] + found["inconclusive"]
     totals = {"tests": len(cases), "failures": found["failure"], "errors": errors, "skipped": found["skipped"]}

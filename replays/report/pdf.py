@@ -8,7 +8,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from replays.report.document import Heading, Paragraph, Picture, Report, ReportPart, Table, fragments, unset
+from replays.report.document import Heading, Paragraph, Picture, Report, ReportPart, Table, fragments, strip_styles
 
 if TYPE_CHECKING:
     from fpdf import FPDF
@@ -113,7 +113,7 @@ def _table(pdf: FPDF, table: Table) -> None:
         headings_style=FontFace(emphasis="BOLD"),
         padding=(0.6, _CELL_SPACE_MM, 0.6, 0.6),  # pyrefly: ignore[bad-argument-type]
     ) as grid:
-        grid.row([unset(heading) for heading in table.headings])
+        grid.row([strip_styles(heading) for heading in table.headings])
         for row, cells in zip(table.rows, _cells(table), strict=True):
             line = grid.row()
             for n, cell in enumerate(cells):
@@ -124,7 +124,7 @@ def _cells(table: Table) -> list[list[str]]:
     """Return the cells as printed, with plain numbers aligned at their decimal points."""
     rows = zip(table.rows, table.tails, strict=True)
     return [
-        [unset(cell) + tail.translate(_FIGURE_SPACES) for cell, tail in zip(row.cells, tails, strict=True)]
+        [strip_styles(cell) + tail.translate(_FIGURE_SPACES) for cell, tail in zip(row.cells, tails, strict=True)]
         for row, tails in rows
     ]
 
@@ -135,7 +135,7 @@ def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:
     for column, heading in enumerate(table.headings):
         lines, words = 0.0, 0.0
         # Bold text is wider, so it is measured in bold.
-        for style, texts in (("B", [unset(heading)]), ("", [row[column] for row in rows])):
+        for style, texts in (("B", [strip_styles(heading)]), ("", [row[column] for row in rows])):
             pdf.set_font(_FONT, style=style, size=_CELL_SIZE_PT)  # pyrefly: ignore[bad-argument-type]
             whole = table.numeric[column] and not style  # a number and its uncertainty stay on one line
             lines = max([lines, *map(pdf.get_string_width, texts)])

@@ -12,7 +12,7 @@ from replays.estimate.intervals import make_interval, pool_estimates, sandwich, 
 from replays.estimate.least_squares import solve
 from replays.estimate.sine import fit_sine, is_sine, quality
 from replays.score.alignment.alignment import align
-from replays.score.alignment.one_begin import Alignment, Source
+from replays.score.alignment.one_begin import Alignment, RowSource
 from replays.score.alignment.stamps import Stamps
 from replays.score.card.scorecard import (
     ANALOGUE,
@@ -31,14 +31,7 @@ from replays.score.records.recorded import Recorded
 from replays.score.records.sent import MIN_SIGNAL_NOISES, Formula, Session
 from replays.score.records.stimulus import Exact, Sampled, Stimulus, remove_noise, split_at_rate
 from replays.score.records.wiring import Wire
-from replays.score.waveform import (
-    Response,
-    Waveform,
-    fit_linear_response,
-    fit_waveform,
-    fit_with_filter,
-    response,
-)
+from replays.score.waveform import Response, Waveform, fit_linear_response, fit_waveform, fit_with_filter, response
 from rig.base import units
 from rig.channels.table import Channel
 
@@ -121,7 +114,7 @@ def fit_channels(
     A signal with several possible channels is fitted only if its channel explains it.
     """
     zero_s = min((signal.first_s for signal in recorded.values() if signal.first_s is not None), default=0.0)
-    tables: dict[int, list[Source]] = {}
+    tables: dict[int, list[RowSource]] = {}
     parts_of: dict[str, tuple[Sampled, Sampled, Sampled] | None] = {}
     for name, wire in wires.items():
         signal = recorded[name]
@@ -146,7 +139,9 @@ def fit_channels(
         begin_s = 0.0 if signal.first_s is None else signal.first_s - zero_s
         within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
         wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
-        source = Source(name, channel, wire, values, begin_s, rate_hz, stimulus if parts is None else parts[0], first_s)
+        source = RowSource(
+            name, channel, wire, values, begin_s, rate_hz, stimulus if parts is None else parts[0], first_s
+        )
         tables.setdefault(id(signal.table), []).append(source)
     found, alignments = [], []
     for sources in tables.values():
@@ -178,7 +173,7 @@ def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
 
 
 def _fit(
-    source: Source, alignment: Alignment, parts: tuple[Sampled, Sampled, Sampled] | None, known: Converter | None
+    source: RowSource, alignment: Alignment, parts: tuple[Sampled, Sampled, Sampled] | None, known: Converter | None
 ) -> Fitted | None:
     name, channel, stimulus = source.name, source.channel, source.stimulus
     values, times_s, curve = alignment.even(source)

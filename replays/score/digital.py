@@ -17,7 +17,7 @@ from replays.score.alignment.placing import SignalRows
 from replays.score.alignment.stamps import Stamps
 from replays.score.card.scorecard import Interval, Scorecard
 from replays.score.records.live import Arrivals
-from replays.score.records.recorded import Recorded, Table
+from replays.score.records.recorded import Recorded, RecordedTable
 from replays.score.records.rows import Followed, follow, repeated_part, row_hashes, stretches, take_rows
 from replays.score.records.scale import Scale
 from replays.score.records.sent import Sent, Session
@@ -80,7 +80,7 @@ def _score_rows(
     sent = Sent(session, groups, one.step, one.phase)
     columns = [sent.names.index(wires[name].channel) for name in names]
 
-    tables: dict[Table, list[str]] = {}
+    tables: dict[RecordedTable, list[str]] = {}
     for name in names:
         tables.setdefault(recorded[name].table, []).append(name)
     beside = recorded[names[0]].table

@@ -12,7 +12,7 @@ import numpy as np
 from replays.recordings.formats import mapping as formats
 from replays.score.alignment.placing import SignalRows, identify_signals
 from replays.score.analogue import score_analogue
-from replays.score.card.limits import Limits, load_limits
+from replays.score.card.limits import ScoreLimits, load_limits
 from replays.score.card.scorecard import (
     FAIL,
     INCONCLUSIVE,
@@ -45,7 +45,7 @@ _CORE = {"digital": "altered values", "analogue": "gain"}
 
 
 def judge(
-    file: Path, against: Sequence[Path], *, limits: Limits | None = None,
+    file: Path, against: Sequence[Path], *, limits: ScoreLimits | None = None,
     path: Literal["digital", "analogue"] | None = None, formulas: Mapping[str, Formula] | None = None,
     options: formats.FileOptions | None = None, arrivals: Arrivals | None = None,
     channels: Sequence[str] | None = None, mapping: formats.Mapping | None = None,

@@ -8,18 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from replays.report import OUTCOME_MARKS, Mark, Report, Row
-from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, new_figure
+from replays.report.canvas import BLUE, ORANGE, RED, axis_label, draw_signals, house_style, new_figure
 from replays.score.analogue import Fitted
-from replays.score.card.scorecard import (
-    FAIL,
-    INCONCLUSIVE,
-    MARKS,
-    NO_LIMIT,
-    PASS,
-    Scorecard,
-    Verdict,
-    make_matrix,
-)
+from replays.score.card.scorecard import FAIL, INCONCLUSIVE, MARKS, NO_LIMIT, PASS, Scorecard, Verdict, make_matrix
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -95,10 +86,10 @@ def _channel(one: Fitted) -> Figure:
     figure = new_figure(6.0)
     ((left, values), (time, gain)) = figure.subplots(2, 2)
     draw_signals(left, clean.times_s, (clean.residual, BLUE, "residual"))
-    left.set(title="Residual", xlabel="time [s]", ylabel=label_of("residual", unit))
+    left.set(title="Residual", xlabel="time [s]", ylabel=axis_label("residual", unit))
     good = one.values[np.isfinite(one.values)]
     values.hist(good, bins=256, color=BLUE)
-    values.set(title="Recorded values", xlabel=label_of(one.name, unit), ylabel="samples", yscale="log")
+    values.set(title="Recorded values", xlabel=axis_label(one.name, unit), ylabel="samples", yscale="log")
     middle, late_s = lateness(one)
     time.plot(middle, 1e9 * late_s, ".", color=ORANGE, ms=4)
     time.set(title="Time error", xlabel="time [s]", ylabel="late [ns]")

@@ -328,14 +328,14 @@ def _fit_filter(
     if n > len(places):  # the filter also needs the instants of lost samples
         even_s = found.times_s[0] + step_s * np.arange(n)
         known, slope = stimulus(even_s + found.late_at(even_s))
-    spectra = [Spectrum.of(values, step_s) for values in (known, slope)]
+    spectra = [Spectrum.from_samples(values, step_s) for values in (known, slope)]
     poles = np.exp(1j * np.pi * (2.0 * np.arange(1, order + 1) + order - 1.0) / (2.0 * order))
     log = math.log(corner_hz)
 
     def passed(spectrum: Spectrum, log_corner: float) -> np.ndarray:
         s = spectrum.turn / (2.0 * math.pi * math.exp(log_corner))
         loss = np.prod([1.0 - s / pole for pole in poles], axis=0)
-        return spectrum.through(np.exp(spectrum.turn * delay_s) / loss)[places[kept]]
+        return spectrum.apply_response(np.exp(spectrum.turn * delay_s) / loss)[places[kept]]
 
     u = (2.0 * (found.times_s - found.middle_s) / span_s)[kept]
     ones = np.ones(len(u))

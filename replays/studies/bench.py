@@ -39,7 +39,7 @@ FRAME_GOAL_US = 100.0
 
 
 @dataclass(frozen=True)
-class Case:
+class BenchCase:
     """One line of the table.
 
     Attributes:
@@ -96,35 +96,35 @@ SPARSE = {"sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
 _DIES_OUT = [{"at_s": 0.02, "command": "hammer", "force_n": 100.0, "duration_ms": 2.0}]
 
 CASES = (
-    Case("split 1e-3, hammer", "hammer", _split(1e-3), goal=450, error_goal=2e-3),
-    Case("split 1e-4, hammer", "hammer", _split(1e-4), goal=300, error_goal=1e-3),
-    Case("split 1e-5, hammer", "hammer", _split(1e-5), goal=150, error_goal=1e-4),
-    Case("split 1e-4 with its companion, hammer", "hammer", _engine("split", 25), error_goal=1e-3),
-    Case("tsit5 1e-6, hammer", "hammer", _engine("tsit5", 500, **{"engine.tolerance": 1e-6})),
-    Case("rk8 1e-8, hammer", "hammer", _engine("rk8", 25)),
-    Case("taylor 1e-8, hammer", "hammer", _engine("taylor", 25, **{"engine.tolerance": 1e-8}), error_goal=1e-6),
-    Case("split 1e-4, free flight, a row every 10 ms", "stable-run", _split(1e-4, **SPARSE), 20.0, goal=20000),
-    Case("split 1e-4, 60 s: bounces, then free", "hammer", _split(1e-4, commands=_DIES_OUT), 60.0, goal=500),
-    Case("split 1e-4, 60 s: bounces, then whirl", "hammer", _split(1e-4), 60.0, goal=3000),
-    Case("split, hammer, all sensors at 20 kHz", "hammer", _SENSORS, goal=120, blocks=True),
-    Case("the same with its companion", "hammer", {}, blocks=True),
-    Case("the same at 51.2 kHz, no companion", "hammer", {**_SENSORS, "sensors.rate_hz": 51_200}, blocks=True),
-    Case(
+    BenchCase("split 1e-3, hammer", "hammer", _split(1e-3), goal=450, error_goal=2e-3),
+    BenchCase("split 1e-4, hammer", "hammer", _split(1e-4), goal=300, error_goal=1e-3),
+    BenchCase("split 1e-5, hammer", "hammer", _split(1e-5), goal=150, error_goal=1e-4),
+    BenchCase("split 1e-4 with its companion, hammer", "hammer", _engine("split", 25), error_goal=1e-3),
+    BenchCase("tsit5 1e-6, hammer", "hammer", _engine("tsit5", 500, **{"engine.tolerance": 1e-6})),
+    BenchCase("rk8 1e-8, hammer", "hammer", _engine("rk8", 25)),
+    BenchCase("taylor 1e-8, hammer", "hammer", _engine("taylor", 25, **{"engine.tolerance": 1e-8}), error_goal=1e-6),
+    BenchCase("split 1e-4, free flight, a row every 10 ms", "stable-run", _split(1e-4, **SPARSE), 20.0, goal=20000),
+    BenchCase("split 1e-4, 60 s: bounces, then free", "hammer", _split(1e-4, commands=_DIES_OUT), 60.0, goal=500),
+    BenchCase("split 1e-4, 60 s: bounces, then whirl", "hammer", _split(1e-4), 60.0, goal=3000),
+    BenchCase("split, hammer, all sensors at 20 kHz", "hammer", _SENSORS, goal=120, blocks=True),
+    BenchCase("the same with its companion", "hammer", {}, blocks=True),
+    BenchCase("the same at 51.2 kHz, no companion", "hammer", {**_SENSORS, "sensors.rate_hz": 51_200}, blocks=True),
+    BenchCase(
         "24 channels at 51.2 kHz, no companion",
         "hammer",
         {**_SENSORS, "channels": _laboratory()},
         goal=60,
         blocks=True,
     ),
-    Case(
+    BenchCase(
         "the same at 20 kHz with its companion, 15 faults",
         "hammer",
         {"commands": _faults("gain", factor=1.1)},
         blocks=True,
     ),
-    Case("the same with 15 late channels", "hammer", {"commands": _faults("late", late_us=500.0)}, blocks=True),
-    Case("split, stable run, all sensors at 20 kHz", "stable-run", {}, blocks=True),
-    Case("rk8 25 us, hammer, all sensors at 20 kHz", "hammer", {"engine.name": "rk8"}, blocks=True),
+    BenchCase("the same with 15 late channels", "hammer", {"commands": _faults("late", late_us=500.0)}, blocks=True),
+    BenchCase("split, stable run, all sensors at 20 kHz", "stable-run", {}, blocks=True),
+    BenchCase("rk8 25 us, hammer, all sensors at 20 kHz", "hammer", {"engine.name": "rk8"}, blocks=True),
 )
 """Cases; the first one is the basis of the ratios."""
 
@@ -179,7 +179,7 @@ def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], No
 
     first = CASES[0].name
     cases = [
-        _judged(case, *ends[case.name], reference, _summary(case.name, speeds[case.name], speeds[first]))
+        _judge_case(case, *ends[case.name], reference, _summary(case.name, speeds[case.name], speeds[first]))
         for case in CASES
     ]
     return {
@@ -203,8 +203,8 @@ def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], No
     }
 
 
-def _judged(
-    case: Case, rows: np.ndarray, simulation: Simulation, reference: np.ndarray, summary: dict[str, Any]
+def _judge_case(
+    case: BenchCase, rows: np.ndarray, simulation: Simulation, reference: np.ndarray, summary: dict[str, Any]
 ) -> dict[str, Any]:
     """Return a case's speeds with its error, residual and goal."""
     error = None
@@ -224,7 +224,7 @@ def _judged(
     }
 
 
-def _run(scene: Scene, case: Case) -> tuple[float, np.ndarray, Simulation]:
+def _run(scene: Scene, case: BenchCase) -> tuple[float, np.ndarray, Simulation]:
     """Return times real time, observed rows (of the last block if there are blocks), and the simulation at its end."""
     simulation = Simulation(scene)
     _ = simulation.first_row
@@ -239,7 +239,7 @@ def _reference(problem: Problem) -> tuple[np.ndarray, float | None, str]:
         return found.solution.states, found.error, " and ".join(found.names)
     rk8 = {"engine.tolerance": 1e-13}
     scene = load_scene("hammer", {**_engine("rk8", 5, **rk8), "duration_s": problem.duration_s})
-    rows = _run(scene, Case("reference", "hammer"))[1]
+    rows = _run(scene, BenchCase("reference", "hammer"))[1]
     return rows[:, :N_STATE].copy(), None, "rk8 alone (install the extra `peers` for two independent codes)"
 
 
@@ -287,15 +287,15 @@ def _frames(frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
     for name, changes in (("engine alone", _split(1e-4)), ("all sensors at 20 kHz", _SENSORS)):
         progress(f"{frames} frames of 1 ms, {name}")
         simulation = Simulation(load_scene("hammer", {**changes, "duration_s": 3600.0}))
-        taken = np.empty(frames)
+        times_s = np.empty(frames)
         with freeze_start_objects():  # as in every run with pacing
             for _ in range(100):
                 simulation.advance(_FRAME_TICKS)
             for n in range(frames):
                 begin = time.thread_time()
                 simulation.advance(_FRAME_TICKS)
-                taken[n] = time.thread_time() - begin
-        low, high, worst = np.quantile(taken, [0.5, 0.999, 1.0]) * 1e6
+                times_s[n] = time.thread_time() - begin
+        low, high, worst = np.quantile(times_s, [0.5, 0.999, 1.0]) * 1e6
         report[name] = {
             "median_us": float(low), "p999_us": float(high), "worst_us": float(worst), "frames": frames,
             "goal_us": FRAME_GOAL_US, "reached": float(high) <= FRAME_GOAL_US,

@@ -52,7 +52,7 @@ class Check:
         return f"error {self.error:.1e} of 1 against {self.finer}; {self.contacts[0]} and {self.contacts[1]} contacts"
 
 
-def finer(scene: Scene) -> dict[str, float]:
+def refine(scene: Scene) -> dict[str, float]:
     """Return changes to a scene's engine that make it more accurate.
 
     Raises:
@@ -77,7 +77,7 @@ def check(scene: Scene) -> Check:
     Raises:
         InputError: If there is no finer step.
     """
-    changes = finer(scene)
+    changes = refine(scene)
     setting = f"tolerance {changes['tolerance']:.2g}" if "tolerance" in changes else f"{changes['step_us']} us"
     coarse, fine = _states(scene, {}), _states(scene, changes)
     n = min(len(coarse[0]), len(fine[0]))

@@ -120,18 +120,18 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
                 "name": name,
                 "formula": law.formula,
                 "source": law.source,
-                **_resolved(parameters, pair, impact, name, restitution)._asdict(),
+                **_match_stiffness(parameters, pair, impact, name, restitution)._asdict(),
                 "wanted": restitution,
-                **_impact(_resolved(parameters, pair, impact, name, restitution), impact, floor),
+                **_impact(_match_stiffness(parameters, pair, impact, name, restitution), impact, floor),
                 "in_use": parameters.rule("contact.damping_factor") == name,
             }
             for name, law in damping.items()
         ],
         "stiffness": [_stiffness(parameters, pair, name) for name in stiffness_laws(parameters)],
         "wanted": wanted,
-        "returned": {name: [_returned_restitution(law, e) for e in wanted] for name, law in damping.items()},
+        "returned": {name: [_compute_restitution(law, e) for e in wanted] for name, law in damping.items()},
         "speed": speeds,
-        "returned_over_speed": returned_over_speeds(parameters, speeds),
+        "returned_over_speed": restitution_curves(parameters, speeds),
         "lean": {
             "angle_mrad": pair.clearance / parameters["shaft.arm_ring"] * 1e3,
             "over_width_um": pair.clearance / parameters["shaft.arm_ring"] * pair.width * 1e6,
@@ -139,7 +139,7 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
     }
 
 
-def returned_over_speeds(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[float]]:
+def restitution_curves(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[float]]:
     """Return the restitution over the approach speed [m/s] for three kinds of damping.
 
     A law with v0 (c from the exact rule) returns the same restitution above the lower limit of v0, and more below it. A
@@ -152,7 +152,7 @@ def returned_over_speeds(parameters: ParameterSet, speeds: list[float]) -> dict[
         stiffness="internal-sphere", exponent=LAW, damping="exact", viscous=LAW,
         restitution=restitution, pair=pair, impact=impact,
     ).law  # fmt: skip
-    linear = _resolved(parameters, pair, impact, KELVIN_VOIGT, restitution)
+    linear = _match_stiffness(parameters, pair, impact, KELVIN_VOIGT, restitution)
     plain = _constant_damping(hertz, impact, restitution)
     return {
         "memory of v0 (exact)": [returned_restitution(hertz.damping_factor * v / max(v, floor)) for v in speeds],
@@ -185,7 +185,7 @@ def draw(parameters: ParameterSet, path: Path) -> None:
 def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) -> None:
     settings = np.linspace(MIN_RESTITUTION, 1.0, 191)
     curves = {
-        name: np.array([_returned_restitution(law, float(e)) for e in settings], float)
+        name: np.array([_compute_restitution(law, float(e)) for e in settings], float)
         for name, law in damping_laws(parameters).items()
     }
     # Sorted by the height of the curves at 0.5.
@@ -214,7 +214,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
     impact, restitution = reference_impact(parameters), parameters["contact.restitution"]
     floor = parameters["contact.speed_floor"]
     speeds = [float(v) for v in np.geomspace(*SPEEDS, 41)]
-    curves = returned_over_speeds(parameters, speeds)
+    curves = restitution_curves(parameters, speeds)
     for (name, values), style in zip(
         curves.items(),
         ({"color": BLACK, "lw": 3.4}, {"color": SKY, "ls": (0, (5, 4))}, {"color": RED}),
@@ -265,7 +265,7 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
     axes.legend(**_LEGEND_BELOW)
 
 
-def _resolved(
+def _match_stiffness(
     parameters: ParameterSet, pair: ContactPair, impact: ReferenceImpact, damping: str, restitution: float
 ) -> NormalLaw:
     """Return the parameters' own stiffness with another damping law; for a linear one, the stiffness of equal depth."""
@@ -299,7 +299,7 @@ def stiffness_laws(parameters: ParameterSet) -> dict[str, StiffnessLaw]:
     return STIFFNESS | ({} if chosen is None else {chosen: stiffness_law(chosen)})
 
 
-def _returned_restitution(law: DampingLaw, restitution: float) -> float | None:
+def _compute_restitution(law: DampingLaw, restitution: float) -> float | None:
     """Return the restitution of a damping law above the lower limit of v0; that of Kelvin-Voigt equals the setting.
 
     Returns None if a formula gives no c for this restitution.

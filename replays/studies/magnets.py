@@ -45,16 +45,16 @@ class MagnetModel(NamedTuple):
 def family(geometry: MagnetGeometry) -> tuple[MagnetModel, ...]:
     """Return the models for these magnets, from the simplest to the most exact."""
 
-    def mapped(name: str, fitted: MagnetMap, runs_as: str) -> MagnetModel:
+    def make_model(name: str, fitted: MagnetMap, runs_as: str) -> MagnetModel:
         return MagnetModel(name, lambda x, y: map_force(x, y, fitted), fitted.stiffness, runs_as)
 
     return (
-        mapped("linear", linear_map(geometry), "level linear"),
-        mapped("far-field map", fit_map(geometry), "level map"),
+        make_model("linear", linear_map(geometry), "level linear"),
+        make_model("far-field map", fit_map(geometry), "level map"),
         MagnetModel(
             "far-field sum", lambda x, y: field_sum_force(x, y, geometry), field_sum_stiffness(geometry), "reference"
         ),
-        mapped("cylinder map", fit_cylinder_map(geometry), "level cylinders"),
+        make_model("cylinder map", fit_cylinder_map(geometry), "level cylinders"),
         MagnetModel(
             "exact cylinders", lambda x, y: cylinder_force(x, y, geometry), cylinder_stiffness(geometry), "reference"
         ),
@@ -73,8 +73,8 @@ def compare(model: Model) -> dict[str, Any]:
     geometry, used = model.magnets, model.constants.magnet.stiffness
     places = [fraction * geometry.reach for fraction in FRACTIONS]
     models = family(geometry)
-    toward = {each.name: _inward(each.force, geometry, np.array(places), 0.0) for each in models}
-    between = {each.name: _inward(each.force, geometry, np.array(places), np.pi / geometry.number) for each in models}
+    toward = {each.name: _pull_n(each.force, geometry, np.array(places), 0.0) for each in models}
+    between = {each.name: _pull_n(each.force, geometry, np.array(places), np.pi / geometry.number) for each in models}
     stiffness = {each.name: each.stiffness for each in models}
     return {
         "set": model.parameters.name,
@@ -144,10 +144,10 @@ def _draw_same_magnets(axes: Any, model: Model) -> None:
     line = np.linspace(-geometry.reach, geometry.reach, 201)
     for each in family(geometry)[1:]:
         style = _STYLES.get(each.name, _DEFAULT_STYLE)
-        toward = -_inward(each.force, geometry, line, 0.0)
+        toward = -_pull_n(each.force, geometry, line, 0.0)
         axes.plot(line * 1e3, toward, label=f"{each.name}, K = {each.stiffness / 1e3:.3f} kN/m", **style)
         if each.name in ("far-field sum", "exact cylinders"):
-            between = -_inward(each.force, geometry, line, np.pi / geometry.number)
+            between = -_pull_n(each.force, geometry, line, np.pi / geometry.number)
             axes.fill_between(line * 1e3, toward, between, color=style["color"], alpha=0.25, lw=0)
     axes.fill_between([], [], [], color="0.5", alpha=0.25, lw=0, label="between magnet and gap")
     axes.set(
@@ -164,7 +164,7 @@ def _draw_same_stiffness(axes: Any, model: Model) -> None:
     line = np.linspace(-geometry.reach, geometry.reach, 201)
     _shade_travel(axes, model, both=True)
     for each in family(geometry):
-        force = -_inward(each.force, geometry, line, 0.0) * used / each.stiffness
+        force = -_pull_n(each.force, geometry, line, 0.0) * used / each.stiffness
         axes.plot(line * 1e3, force, label=each.name, **_STYLES.get(each.name, _DEFAULT_STYLE))
     axes.set(
         title=f"At the rig's stiffness at the centre, {used / 1e3:.3g} kN/m",
@@ -237,7 +237,7 @@ def _shade_travel(axes: Any, model: Model, *, both: bool = False) -> None:
     axes.axvspan(-travel if both else 0.0, travel, color="0.93", zorder=0, label="where the ring lets the shaft go")
 
 
-def _inward(force: Force, geometry: MagnetGeometry, radii: np.ndarray, angle: float) -> np.ndarray:
+def _pull_n(force: Force, geometry: MagnetGeometry, radii: np.ndarray, angle: float) -> np.ndarray:
     """Return the force toward the centre [N] at signed radii [m], shapes (n,), on a line at an angle to a magnet."""
     outward = np.array([np.sin(angle), -np.cos(angle)])
     return -force(radii * outward[0], radii * outward[1]) @ outward

@@ -134,7 +134,7 @@ class Generator(Signal):
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class VoltageSource:
     """Voltage source at the converter of one channel.
 
     Attributes:
@@ -185,18 +185,18 @@ class Source:
         return self.middle_v + self.amplitude_v * wave
 
 
-def _sine(source: Source, instants: Instants) -> np.ndarray:
+def _sine(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return a sine: w = sin(2 pi (f t + phase/360))."""
     return np.sin(2.0 * np.pi * instants.cycles(_frequency(source), source.phase_lead))
 
 
-def _two_tone(source: Source, instants: Instants) -> np.ndarray:
+def _two_tone(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return two tones: w = (sin(2 pi (f1 t + phase/360)) + sin(2 pi (f2 t + phase/360))) / 2, at most 1."""
     tones = [instants.cycles(exact(hz), source.phase_lead) for hz in source.signal.frequencies or ()]
     return np.sum([0.5 * np.sin(2.0 * np.pi * turns) for turns in tones], axis=0)
 
 
-def _chirp(source: Source, instants: Instants) -> np.ndarray:
+def _chirp(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return repeated linear sweeps from f1 to f2: w = sin(2 pi (f1 s + (f2 - f1) s^2 / (2 T))), s = t mod T."""
     low, high = source.signal.frequencies or (0.0, 0.0)
     part, period_s = instants.cycles(1 / _period(source), source.phase_lead), float(_period(source))
@@ -204,19 +204,19 @@ def _chirp(source: Source, instants: Instants) -> np.ndarray:
     return np.sin(2.0 * np.pi * (turns - np.floor(turns)))
 
 
-def _step(source: Source, instants: Instants) -> np.ndarray:
+def _step(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return steps: w = -1 in the first half of each period, 1 in the second."""
     return np.where(
         np.floor(2.0 * instants.cycles(1 / _period(source), source.phase_lead) + _EDGE_TOL) == 1.0, 1.0, -1.0
     )
 
 
-def _pulse(source: Source, instants: Instants) -> np.ndarray:
+def _pulse(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return pulses: w = 1 in the first 10/360 of each period, else 0."""
     return np.where(instants.cycles(_frequency(source), source.phase_lead) + _EDGE_TOL < float(_PULSE_LENGTH), 1.0, 0.0)
 
 
-def _prbs(source: Source, instants: Instants) -> np.ndarray:
+def _prbs(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return a pseudo-random binary sequence: w = 1 or -1, chip floor(f t) modulo 2^order - 1 (see `chips`)."""
     sequence = chips(source.signal.order or 0, source.signal.seed or 1)
     length = len(sequence)
@@ -224,7 +224,7 @@ def _prbs(source: Source, instants: Instants) -> np.ndarray:
     return sequence[np.floor(turns * length + _EDGE_TOL).astype(np.int64) % length]
 
 
-def _multisine(source: Source, instants: Instants) -> np.ndarray:
+def _multisine(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return a multisine: w = sum cos(2 pi (f_k t + phase/360) - s pi k^2 / N) / peak, k = 0..N-1, s by the crest."""
     frequencies = source.signal.frequencies or ()
     phases, peak = multisine_phases(frequencies, source.signal.crest)
@@ -234,17 +234,17 @@ def _multisine(source: Source, instants: Instants) -> np.ndarray:
     return total / peak
 
 
-def _ramp(source: Source, instants: Instants) -> np.ndarray:
+def _ramp(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return a ramp: w = 2 ((t/T) mod 1) - 1; without an amplitude, it passes every code of the converter."""
     return 2.0 * instants.cycles(1 / _period(source), source.phase_lead) - 1.0
 
 
-def _quiet(source: Source, instants: Instants) -> np.ndarray:
+def _quiet(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return w = 0, which leaves bias, offset and noise."""
     return np.zeros(len(instants.seconds))
 
 
-def _recorded(source: Source, instants: Instants) -> np.ndarray:
+def _recorded(source: VoltageSource, instants: Instants) -> np.ndarray:
     """Return a repeated recording: w = periodic cubic spline through the waveform's values, in the channel's unit."""
     assert source.waveform is not None
     period, pieces = source.waveform
@@ -258,7 +258,7 @@ def _recorded(source: Source, instants: Instants) -> np.ndarray:
 class SignalKind(NamedTuple):
     """Kind of signal: wave, required fields, and optional fields other than phase, delay and offset."""
 
-    wave: Callable[[Source, Instants], np.ndarray]
+    wave: Callable[[VoltageSource, Instants], np.ndarray]
     required: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
     amplitude: bool | None = True
@@ -281,7 +281,7 @@ KINDS: dict[str, SignalKind] = {
 _OFFSETS, _AMPLITUDES, _SHIFTS = ("offset", "offset_v"), ("amplitude", "amplitude_v"), ("phase_deg", "delay_us")
 
 
-def sources(generator: Generator, table: ChannelTable, speed_hz: float = 0.0) -> dict[str, Source]:
+def sources(generator: Generator, table: ChannelTable, speed_hz: float = 0.0) -> dict[str, VoltageSource]:
     """Return the source of every channel.
 
     Args:
@@ -305,7 +305,7 @@ def sources(generator: Generator, table: ChannelTable, speed_hz: float = 0.0) ->
     }
 
 
-def _source(generator: Generator, channel: Channel, position: float, speed_hz: float) -> Source:
+def _source(generator: Generator, channel: Channel, position: float, speed_hz: float) -> VoltageSource:
     own = generator.channels.get(channel.name)
     if own is None and speed_hz > 0.0:
         if channel.signal == "keyphasor":
@@ -321,7 +321,7 @@ def _source(generator: Generator, channel: Channel, position: float, speed_hz: f
     gain, phase_lead = channel.sensitivity_v, (merged.phase_deg or 0.0) / 360.0 + (position if generator.apart else 0.0)
     offset_v = merged.offset_v if merged.offset_v is not None else (merged.offset or 0.0) * gain
     peak_v = merged.amplitude_v if merged.amplitude_v is not None else (merged.amplitude or 0.0) * gain
-    found = Source(channel, merged, peak_v, channel.bias_v + offset_v, phase_lead)
+    found = VoltageSource(channel, merged, peak_v, channel.bias_v + offset_v, phase_lead)
     if merged.kind == "ramp" and not {*_AMPLITUDES} & {*signal}:
         found = replace(found, amplitude_v=channel.adc_v, middle_v=offset_v)
     if merged.kind == "recorded":
@@ -380,11 +380,11 @@ def _check_rate(signal: Signal, channel: Channel, field: str) -> None:
             raise InputError(f"{field}.{name}", f"{must} of {channel.name}, whose converter has no filter", value)
 
 
-def _frequency(source: Source) -> Fraction:
+def _frequency(source: VoltageSource) -> Fraction:
     return exact(source.signal.frequency_hz or 1.0)
 
 
-def _period(source: Source) -> Fraction:
+def _period(source: VoltageSource) -> Fraction:
     return exact(source.signal.period_s or 1.0)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from rig.channels.faults import At, Kind, connect_swaps
 from rig.channels.faults.delivery import Active
-from rig.channels.generators import Instants, Source, exact
+from rig.channels.generators import Instants, VoltageSource, exact
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.sensors.keyphasor import FRACTIONS
 from rig.channels.sensors.noise import noise_streams
@@ -51,7 +51,7 @@ class Calibrator:
     def __init__(
         self,
         groups: Iterable[Group],
-        sources: dict[str, Source],
+        sources: dict[str, VoltageSource],
         *,
         seed: int,
         noise: bool,

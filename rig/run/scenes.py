@@ -15,7 +15,7 @@ from rig.base.errors import InputError, Words, such_as
 from rig.channels.channel_file import check_table, read_channels
 from rig.channels.faults import Setting
 from rig.channels.formula import Formulas
-from rig.channels.generators import Generator, Source, sources
+from rig.channels.generators import Generator, VoltageSource, sources
 from rig.channels.sampling import SensorChoice, check_rates, row_ticks
 from rig.channels.table import ChannelTable, check_signals, default_table
 from rig.physics.engine_choice import EngineChoice
@@ -228,7 +228,7 @@ class Scene(Written):
         """Conditions that determine which faults are possible."""
         return Setting(self.sensors.chain == "ideal", self.sensors.noise, self.generator is not None)
 
-    def sources(self) -> dict[str, Source]:
+    def sources(self) -> dict[str, VoltageSource]:
         """Return the generator's signal at the converter of each active channel: `sources()["disk_x"].volts(times_s)`.
 
         Raises:

@@ -293,7 +293,7 @@ def list_operations() -> dict[str, Use]:
     from recorder.rewrite import cut, recover
     from replays.player.messages import Track
     from replays.player.timeline import By, Timeline
-    from replays.recordings.formats.exporting.export import export, merged
+    from replays.recordings.formats.exporting.export import export, holds_one_table
     from replays.recordings.formats.exporting.selection import select
     from replays.recordings.resimulation.experiment import Experiment
     from rig.cli.commands import info
@@ -309,7 +309,7 @@ def list_operations() -> dict[str, Use]:
     def exported(suffix: str) -> Use:
         def use(path: Path, folder: Path) -> object:
             output = folder / f"out{suffix}"
-            return export(select(join([path]), merged=merged(output), truth=True), output, force=True)
+            return export(select(join([path]), merged=holds_one_table(output), truth=True), output, force=True)
 
         return use
 
@@ -325,5 +325,5 @@ def list_operations() -> dict[str, Use]:
         "recover": lambda path, folder: recover(path, folder / "new.mcap", force=True),
         "cut": lambda path, folder: cut(join([path]), folder / "new.mcap", from_s=0.0005, force=True),
         "play": played,
-        "experiment": lambda path, _: Experiment.of(join([path])),
+        "experiment": lambda path, _: Experiment.from_recording(join([path])),
     }

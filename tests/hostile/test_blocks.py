@@ -23,7 +23,7 @@ from drivers.link import LinkTimeoutError
 from drivers.sources.rig import RigSource
 from drivers.sources.samples import Samples, StreamEndedError
 from recorder.contents.summary import Summary
-from recorder.output.disk_limits import Limits
+from recorder.output.disk_limits import DiskLimits
 from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording, join
 from recorder.session import RecordingSession
@@ -202,8 +202,8 @@ def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder.session, "QUIET_S", 0.05)
 
 
-@pytest.mark.parametrize("limits", [Limits(), Limits(rotate_s=1.0)], ids=["one file", "several files"])
-def test_a_recording_contains_only_valid_rows(tmp_path: Path, limits: Limits) -> None:
+@pytest.mark.parametrize("limits", [DiskLimits(), DiskLimits(rotate_s=1.0)], ids=["one file", "several files"])
+def test_a_recording_contains_only_valid_rows(tmp_path: Path, limits: DiskLimits) -> None:
     client = ScriptedClient()
     session = RecordingSession(client, tmp_path / "run.mcap", limits=limits)
     summary, true = record_fed(session, client, input_count(3000), seed=1)

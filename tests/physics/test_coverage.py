@@ -21,7 +21,7 @@ from recorder.reader import Recording
 from replays.recordings.export import write_run
 from replays.recordings.identification import ask, identify
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.sensitivity import value_of
+from replays.recordings.resimulation.sensitivity import get_value
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
 
@@ -41,8 +41,8 @@ def check_intervals(recording: Recording, keys: tuple[str, ...]) -> tuple[dict[s
 
     Without an interval there is no entry, and None.
     """
-    experiment = Experiment.of(recording)
-    truth = {key: value_of(experiment, key) for key in keys}
+    experiment = Experiment.from_recording(recording)
+    truth = {key: get_value(experiment, key) for key in keys}
     found = identify(
         ask(recording, experiment, keys, start={key: _START_FACTOR * value for key, value in truth.items()})
     )

@@ -23,7 +23,7 @@ import pytest
 
 from replays.studies.peers import Problem
 from replays.studies.peers.common.right_hand_side import derivative, pack
-from replays.studies.stability.trials.motion import Motion, base_model, move, pivoted_mass, quiet_inputs, state
+from replays.studies.stability.trials.motion import MotionResult, base_model, move, pivoted_mass, quiet_inputs, state
 from rig.physics.kernels.constants import Constants, Inputs
 from rig.physics.kernels.laws.contact import FLIGHT, TOUCHING
 from rig.physics.levels import ModelLevels
@@ -65,7 +65,7 @@ def compute_rates(
     return derivative(t, y[:14].copy(), pack(given))
 
 
-def run(constants: Constants, inputs: Inputs, y0: np.ndarray, *, ticks: int, every: int = 0) -> Motion:
+def run(constants: Constants, inputs: Inputs, y0: np.ndarray, *, ticks: int, every: int = 0) -> MotionResult:
     return move("rk8", constants, inputs, y0, ticks=ticks, every=every, tolerance=1e-12)
 
 
@@ -202,7 +202,7 @@ def test_level_top_precesses_steadily_at_large_angles() -> None:
     assert motion.column("theta_rate") == pytest.approx(w, rel=1e-10)
 
 
-def get_lateral(motion: Motion) -> np.ndarray:
+def get_lateral(motion: MotionResult) -> np.ndarray:
     """Return x + i y of the axis at unit arm, small angles, shape (n,)."""
     return motion.column("beta") - 1j * motion.column("Gamma")
 
@@ -246,7 +246,7 @@ def test_drive_and_hammer_alone() -> None:
     inputs = quiet_inputs(pulse=(100.0, 2000, 7000))
     wanted = constants.shaft.arm_disk * 100.0 * 5e-3 * 2 / math.pi / constants.shaft.transverse_inertia
     for (x, y), rate in (((1.0, 0.0), "beta_rate"), ((0.0, -1.0), "Gamma_rate")):
-        end = run(constants, inputs._replace(hammer_x=x, hammer_y=y), state(), ticks=10_000).end_of(rate)
+        end = run(constants, inputs._replace(hammer_x=x, hammer_y=y), state(), ticks=10_000).final_value(rate)
         assert end == pytest.approx(wanted, rel=1e-4)  # the cosine at the hammer's arm is 1 to 2e-5
 
 
@@ -262,13 +262,13 @@ def test_sliding_impact_has_coulombs_impulse(sense: float) -> None:
     y0 = state(beta=(1.0 - 1e-6) * constants.contact.clearance / arm, beta_rate=v / arm, theta_rate=spin)
     done = run(constants, quiet_inputs(spin=spin, ideal=True), y0, ticks=100)
     assert done.contacts == 1
-    vx, vy = arm * done.end_of("beta_rate"), -arm * done.end_of("Gamma_rate")
+    vx, vy = arm * done.final_value("beta_rate"), -arm * done.final_value("Gamma_rate")
     assert vx < 0.0
     # Friction pushes the top of the scene down if the shaft turns forward: against the surface's motion.
     assert vy / (v - vx) == pytest.approx(-sense * constants.contact.friction, rel=2e-3)
     # The drive supplies the work that holds the speed: w x (R_S x tangential impulse).
     paid = 200.0 * constants.shaft.radius * abs(vy) * pivoted_mass(constants)
-    assert done.end_of("drive_work") == pytest.approx(paid, rel=2e-3)
+    assert done.final_value("drive_work") == pytest.approx(paid, rel=2e-3)
 
 
 def test_house_under_a_steady_load_is_springs() -> None:

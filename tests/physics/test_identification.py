@@ -22,7 +22,7 @@ from recorder.reader import Recording
 from replays.recordings.export import write_run
 from replays.recordings.identification import Identification, ask, identify
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.sensitivity import value_of
+from replays.recordings.resimulation.sensitivity import get_value
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
 
@@ -48,14 +48,16 @@ def scaled_errors(identification: Identification, truth: dict[str, float]) -> di
 def truth() -> dict[str, float]:
     usual = Experiment(scene=load_scene("hammer"))
     parts = {"magnet.stiffness": 1.04, "contact.friction": 0.95, "contact.stiffness": 1.05, "ring.offset_y": 0.97}
-    return {key: value_of(usual, key) * part for key, part in parts.items()} | {"ring.offset_x": 0.03}
+    return {key: get_value(usual, key) * part for key, part in parts.items()} | {"ring.offset_x": 0.03}
 
 
 @pytest.mark.parametrize("engine", ["split", "taylor"])
 def test_truth_is_recovered_from_a_hammer_recording(tmp_path: Path, truth: dict[str, float], engine: str) -> None:
     changes = {key.replace(".", "__"): value for key, value in truth.items()}
     recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.1, engine__name=engine, seed=11, **changes)
-    experiment = Experiment.of(recording).changed({"parameters": "corrected", "set": {}, "engine.name": "split"})
+    experiment = Experiment.from_recording(recording).with_changes(
+        {"parameters": "corrected", "set": {}, "engine.name": "split"}
+    )
     found = identify(ask(recording, experiment, KEYS))
     errors = scaled_errors(found, truth)
     assert set(errors) == set(KEYS)
@@ -70,8 +72,10 @@ def test_truth_is_recovered_from_a_hammer_recording(tmp_path: Path, truth: dict[
 
 def test_a_start_ten_per_cent_off_converges(tmp_path: Path) -> None:
     recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.06, seed=5)
-    experiment = Experiment.of(recording)
-    right = {key: value_of(experiment, key) for key in ("contact.friction", "contact.restitution", "contact.stiffness")}
+    experiment = Experiment.from_recording(recording)
+    right = {
+        key: get_value(experiment, key) for key in ("contact.friction", "contact.restitution", "contact.stiffness")
+    }
     start = {
         "contact.friction": 0.275,
         "contact.restitution": 0.81,
@@ -88,7 +92,7 @@ def test_intervals_agree_with_the_scatter_of_repeated_fits(tmp_path: Path) -> No
     values, widths = [], []
     for seed in range(8):
         recording = recorded(tmp_path / "s.mcap", "stable-run", duration_s=0.05, seed=seed, sensors__rate_hz=2000)
-        found = identify(ask(recording, Experiment.of(recording), keys, channels=("ring_x", "ring_y")))
+        found = identify(ask(recording, Experiment.from_recording(recording), keys, channels=("ring_x", "ring_y")))
         values.append([finding.value for finding in found.judgement.findings])
         widths.append([finding.half_width for finding in found.judgement.findings])
     scatter = np.std(values, axis=0, ddof=1)
@@ -101,14 +105,18 @@ def test_intervals_agree_with_the_scatter_of_repeated_fits(tmp_path: Path) -> No
 def test_moduli_act_only_together(tmp_path: Path) -> None:
     recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.04, seed=3)
     found = identify(
-        ask(recording, Experiment.of(recording), ("shaft.young_modulus", "ring.young_modulus", "contact.friction"))
+        ask(
+            recording,
+            Experiment.from_recording(recording),
+            ("shaft.young_modulus", "ring.young_modulus", "contact.friction"),
+        )
     )
     shaft, ring, friction = found.judgement.findings
     assert shaft.standing == ring.standing == "only together"
     assert friction.standing == "identified"
     match = re.search(r"\+(\S+) Pa is compensated by ring.young_modulus by (\S+) Pa", shaft.words)
     assert match is not None
-    parameters = Experiment.of(recording).scene.load_parameters()
+    parameters = Experiment.from_recording(recording).scene.load_parameters()
     ratio = (parameters["ring.young_modulus"] / parameters["shaft.young_modulus"]) ** 2
     assert float(match[2]) / float(match[1]) == pytest.approx(-ratio, rel=0.02)
 
@@ -117,7 +125,7 @@ def test_a_drop_identifies_neither_friction_nor_magnets(tmp_path: Path) -> None:
     """A released shaft has neither their stiffness nor their damping; the ring's place is given, not by the sag."""
     recording = recorded(tmp_path / "d.mcap", "drop", duration_s=0.06, seed=3, ring__offset_y=-1.56)
     keys = ("contact.friction", "magnet.stiffness", "contact.restitution")
-    found = identify(ask(recording, Experiment.of(recording), keys))
+    found = identify(ask(recording, Experiment.from_recording(recording), keys))
     friction, magnet, restitution = found.judgement.findings
     assert friction.standing == magnet.standing == "not seen"
     assert restitution.standing == "identified"

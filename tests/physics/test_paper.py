@@ -27,10 +27,10 @@ import numpy as np
 import pytest
 
 from replays.studies.paper.findings import conditions
-from replays.studies.paper.open_questions import compute_fall, weight_at_ring
+from replays.studies.paper.open_questions import compute_fall, ring_weight
 from replays.studies.paper.reproduction import drop_impact, drop_impulse
 from replays.studies.paper.scans import condition
-from replays.studies.paper.scans.pulse import Outcome, Pulse, outcome
+from replays.studies.paper.scans.pulse import Pulse, PulseRun, outcome
 from replays.studies.stability.trials.motion import base_model, move, quiet_inputs, state
 from rig.physics.levels import ModelLevels
 from rig.physics.parameters import load_parameters
@@ -58,7 +58,7 @@ def drop(parameters: str) -> Run:
 
 
 @cache
-def held(speed_hz: float, stator: str = "two-houses") -> Outcome:
+def held(speed_hz: float, stator: str = "two-houses") -> PulseRun:
     changes = {"drive.mode": "ideal", "model.stator": stator}
     return outcome(Pulse(changes=changes, speed_hz=speed_hz, force_n=150.0))
 
@@ -92,7 +92,7 @@ def test_ring_returns_the_momentum_of_the_weight(parameters):
     run = drop(parameters)
     weight = P["shaft.mass"] * 9.81 * P["shaft.arm_centre"] / P["shaft.arm_ring"]
     assert run["contact_impulse"][-1] == pytest.approx(weight * run.times_s[-1], rel=1e-3)
-    assert weight_at_ring(run.simulation.model.constants) == pytest.approx(weight, rel=1e-12)
+    assert ring_weight(run.simulation.model.constants) == pytest.approx(weight, rel=1e-12)
 
 
 @pytest.mark.parametrize("parameters", ["as-printed", "corrected"])
@@ -197,14 +197,14 @@ def test_slip_to_rolling():
 
     polar, spin = P["shaft.polar_inertia"], 2 * math.pi * 6.2
     natural = math.sqrt(STIFFNESS / MASS)
-    for slip in condition.slips_to_rolling():
+    for slip in condition.find_slips():
         begin = 2 * math.pi * slip.whirl_hz
         after = (polar * spin + MASS * RS * R0 * begin) / (polar + MASS * RS**2)
         time_s: Any = quad(lambda w: 1 / (P["contact.friction"] * (w * w - natural**2)), begin, after * RS / R0)
         assert slip.kept == pytest.approx(after / spin, rel=2e-3)
         assert slip.time_s == pytest.approx(float(time_s[0]), rel=5e-3)
         assert (slip.kept_closed, slip.time_closed_s) == pytest.approx((after / spin, float(time_s[0])), rel=1e-9)
-    kept = condition.spin_kept(base_model(ModelLevels()).constants)
+    kept = condition.remaining_spin(base_model(ModelLevels()).constants)
     assert kept == pytest.approx(polar / (polar + MASS * RS**2), rel=1e-12)
 
 

@@ -24,11 +24,11 @@ from replays.studies.stability.scenes import scene_atlas
 from replays.studies.stability.scenes.scene_atlas import (
     HATCHES,
     OUTCOMES,
-    Outcome,
-    chosen_scenes,
+    SceneOutcome,
     draw_scene_atlas,
     is_silent,
     outcomes,
+    select_scenes,
 )
 from rig.base.errors import InputError
 from tests.commands import run_captured
@@ -38,47 +38,47 @@ ENGINES = ["split", "verlet", "semi-implicit-euler"]
 
 
 @pytest.fixture(scope="module")
-def found() -> list[Outcome]:
+def found() -> list[SceneOutcome]:
     return [*outcomes(["hammer-6.2"], [*ENGINES, "scipy-lsoda"])]
 
 
-def kinds(found: list[Outcome], method: str) -> dict[str, str]:
+def kinds(found: list[SceneOutcome], method: str) -> dict[str, str]:
     return {one.setting: one.kind for one in found if one.method == method}
 
 
-def test_the_default_engine_is_accurate_at_each_setting(found: list[Outcome]) -> None:
+def test_the_default_engine_is_accurate_at_each_setting(found: list[SceneOutcome]) -> None:
     assert set(kinds(found, "split").values()) == {"right"}
     assert not any(is_silent(one) for one in found if one.method == "split")
 
 
-def test_verlet_is_wrong_with_or_without_a_warning(found: list[Outcome]) -> None:
+def test_verlet_is_wrong_with_or_without_a_warning(found: list[SceneOutcome]) -> None:
     verlet = kinds(found, "verlet")
     assert (verlet["50 us"], verlet["10 us"]) == ("told", "silent")
 
 
-def test_an_unsupported_law_is_refused(found: list[Outcome]) -> None:
+def test_an_unsupported_law_is_refused(found: list[SceneOutcome]) -> None:
     assert set(kinds(found, "semi-implicit-euler").values()) == {"refused"}
 
 
-def test_a_peer_at_a_loose_tolerance_is_wrong_without_warning(found: list[Outcome]) -> None:
+def test_a_peer_at_a_loose_tolerance_is_wrong_without_warning(found: list[SceneOutcome]) -> None:
     assert kinds(found, "scipy-lsoda")["1e-3"] == "silent"
     assert kinds(found, "scipy-lsoda")["1e-8"] == "right"
 
 
-def test_each_outcome_is_drawn(found: list[Outcome], tmp_path: Path) -> None:
-    every = [Outcome(scene, "split", kind, kind, None) for scene in TWELVE_SCENES for kind in OUTCOMES]
+def test_each_outcome_is_drawn(found: list[SceneOutcome], tmp_path: Path) -> None:
+    every = [SceneOutcome(scene, "split", kind, kind, None) for scene in TWELVE_SCENES for kind in OUTCOMES]
     picture, vector = draw_scene_atlas(tmp_path, [*every, *found])
     assert picture.stat().st_size > 20_000
     assert all(title.split(",")[0] in vector.read_text() for _, title in OUTCOMES.values())
 
 
 def test_an_unknown_scene_is_refused() -> None:
-    assert chosen_scenes(None) == list(TWELVE_SCENES)
-    assert chosen_scenes("run-up, Drop,drop,") == ["drop", "run-up"]
+    assert select_scenes(None) == list(TWELVE_SCENES)
+    assert select_scenes("run-up, Drop,drop,") == ["drop", "run-up"]
     with pytest.raises(InputError, match=r"--only must be one or more of hammer-3.2, .*; instead received 'hamer'"):
-        chosen_scenes("drop,hamer")
+        select_scenes("drop,hamer")
     with pytest.raises(InputError, match=r"--only must be one or more of .*; instead received ','"):
-        chosen_scenes(",")
+        select_scenes(",")
 
 
 @pytest.mark.parametrize("more", [["--full"], ["--random", "3"]])
@@ -91,8 +91,8 @@ def test_an_option_of_another_study_is_refused(more: list[str], capsys: pytest.C
 def test_a_stopped_atlas_shows_its_measurements(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def stopped(*_: object, **__: object) -> Iterator[Outcome]:
-        yield Outcome("drop", "split", "1e-2", "right", 1e-3)
+    def stopped(*_: object, **__: object) -> Iterator[SceneOutcome]:
+        yield SceneOutcome("drop", "split", "1e-2", "right", 1e-3)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(scene_atlas, "outcomes", stopped)

@@ -113,10 +113,10 @@ def test_rk4_damps_as_theory_says():
 
 
 def test_unknown_names_are_refused():
-    from replays.studies.stability.table import chosen_engines, chosen_trials
+    from replays.studies.stability.table import select_engines, select_trials
 
-    assert chosen_trials("t3, T7") == ["T3", "T7"]
+    assert select_trials("t3, T7") == ["T3", "T7"]
     with pytest.raises(InputError, match="T99"):
-        chosen_trials("T99")
+        select_trials("T99")
     with pytest.raises(InputError, match="euler-forward"):
-        chosen_engines("euler-forward")
+        select_engines("euler-forward")

@@ -19,9 +19,9 @@ import pytest
 
 from replays.studies.common.journal import Journal
 from replays.studies.common.random_scene import draw_scene
-from replays.studies.stability.scenes.sweep import NAME, chosen_numbers, summary, sweep
+from replays.studies.stability.scenes.sweep import NAME, select_numbers, summary, sweep
 from replays.studies.stability.scenes.truth import CHAOS_GROWTH, INITIAL_SHIFT, measure
-from replays.studies.stability.scenes.worker import Run, Task, Worker, end_after, run_task, shift_start
+from replays.studies.stability.scenes.worker import SceneRun, Task, Worker, limit_processor_time, run_task, shift_start
 from rig.base.errors import InputError
 from rig.cli.main import main
 from rig.physics.contacts import DAMPING, STIFFNESS
@@ -55,7 +55,7 @@ def test_another_law_is_detected() -> None:
     # The same engines at another restitution: a difference that the fixed scenes treat as small is large.
     scene = change_scene(draw_scene(7, 7), {"duration_s": 0.08})
 
-    def other(task: Task) -> Run:
+    def other(task: Task) -> SceneRun:
         softer = {"contact.restitution": 0.9 * scene.load_parameters()["contact.restitution"]}
         return run_task(task._replace(scene=change_scene(scene, softer)) if task.engine == DEFAULT else task)
 
@@ -65,7 +65,7 @@ def test_another_law_is_detected() -> None:
 def make_stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None, *, grows: float = 1.0):
     """Return a stub of runs at rest, each engine off by a shift in the error's norm; `own`: other fields by engine."""
 
-    def run(task: Task) -> Run:
+    def run(task: Task) -> SceneRun:
         states = np.zeros((100, N_STATE))
         states[:] = shifts.get(task.engine, 0.0) * STATE_SCALE
         if task.nudge:
@@ -75,7 +75,7 @@ def make_stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = 
         changes = (own or {}).get(task.engine, {})
         fields["health"] = health | {key: changes[key] for key in changes if key in health}
         fields |= {key: changes[key] for key in changes if key not in health}
-        return Run(**fields)
+        return SceneRun(**fields)
 
     return run
 
@@ -178,7 +178,7 @@ def test_a_nudge_is_small_and_inside_the_ring(position: str) -> None:
 def test_a_stopped_sweep_continues(tmp_path) -> None:
     calls: list[Task] = []
 
-    def run(task: Task) -> Run:
+    def run(task: Task) -> SceneRun:
         calls.append(task)
         return run_stub(task)
 
@@ -209,7 +209,7 @@ class _HangingScene:
     """An invalid scene: reading its fields never returns."""
 
     def model_dump(self) -> Any:
-        end_after(1.0)
+        limit_processor_time(1.0)
         while True:
             pass
 
@@ -251,10 +251,10 @@ def test_command_prints_stores_and_draws(tmp_path, capsys: pytest.CaptureFixture
 
 
 def test_numbers_of_scenes_are_refused_unless_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    assert chosen_numbers("3, 14", 5) == [3, 14]
-    assert chosen_numbers(None, 3) == [0, 1, 2]
+    assert select_numbers("3, 14", 5) == [3, 14]
+    assert select_numbers(None, 3) == [0, 1, 2]
     with pytest.raises(InputError, match="--only"):
-        chosen_numbers("T3", 5)
+        select_numbers("T3", 5)
     with pytest.raises(SystemExit, match="2"):
         main(["stability", "--random", "2", "--only", "x"])
     assert "--only must be numbers of scenes joined by commas" in capsys.readouterr().err

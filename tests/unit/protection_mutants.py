@@ -88,8 +88,8 @@ MUTANTS = [
     Mutant("1oo2 as 2oo2", "one_out_of_two_needs_one", 'if self.settings.vote == "1oo2":', "if False:"),
     Mutant(
         "peak instead of peak-to-peak", "a_sine_is_measured_from_peak_to_peak",
-        "_sliding(np.fmax, rows, self._window) - _sliding(np.fmin, rows, self._window)",
-        "_sliding(np.fmax, abs(rows), self._window)",
+        "_sliding_extreme(np.fmax, rows, self._window) - _sliding_extreme(np.fmin, rows, self._window)",
+        "_sliding_extreme(np.fmax, abs(rows), self._window)",
     ),
     Mutant(
         "gap not taken away", "an_orbit_is_measured_from_its_mean", "probes - np.array(means)[:, 1:]",

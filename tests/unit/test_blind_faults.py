@@ -13,7 +13,7 @@ import pytest
 from recorder.reader import Recording
 from recorder.rewrite import cut
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import measured, predict
+from replays.recordings.resimulation.prediction import predict, read_measured
 from replays.recordings.validation import validate
 from replays.recordings.validation.bits import Bits
 from replays.recordings.validation.explanations.explanation import Explanation
@@ -38,8 +38,8 @@ RANDOM = ("intermittent", "spikes")
 
 def find_faults(recording: Recording) -> tuple[list[Explanation], set[str]]:
     """Return the findings of a blind validation, and the channels that differ."""
-    experiment = Experiment.of(recording).without_faults()
-    parts, bits = measured(recording, experiment.scene), Bits(recording, experiment.simulation().table)
+    experiment = Experiment.from_recording(recording).without_faults()
+    parts, bits = read_measured(recording, experiment.scene), Bits(recording, experiment.simulation().table)
     nominal = predict(experiment, parts, follow=bits.follow)
     bits.finish()
     explanations = own_faults(

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from replays.campaigns.files.campaign import Campaign, campaign_path, load_campaign, read_title, shipped
-from replays.campaigns.files.line_numbers import lines_of
+from replays.campaigns.files.campaign import Campaign, campaign_path, find_shipped, load_campaign, read_title
+from replays.campaigns.files.line_numbers import number_lines
 from rig.base.errors import InputError
 from tests.commands import run_captured
 
@@ -230,7 +230,7 @@ SHIPPED = {
 
 
 def test_shipped_campaigns_are_listed_by_name_and_load(capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(shipped()) == list(SHIPPED)
+    assert list(find_shipped()) == list(SHIPPED)
     status, out, err = run_captured(capsys, "campaign")
     assert (status, err) == (0, "")
     for name, count in SHIPPED.items():
@@ -297,7 +297,7 @@ def test_a_matrix_is_the_product_of_its_axes(tmp_path: Path) -> None:
 
 def test_line_numbers_inside_tables_lists_and_inline_tables() -> None:
     text = 'a.b = """\n x = 1\n"""\n[[c]]\nd = [1, # [\n  { "e.f" = "}" },\n]\n[c.g]\nh = 2\n[[c]]\ni = \'[\'\n'
-    found = lines_of(text)
+    found = number_lines(text)
     assert found == {
         "a.b": 1, "c": 4, "c.0": 4, "c.0.d": 5, "c.0.d.0": 5, "c.0.d.1": 6, "c.0.d.1.e.f": 6, "c.0.g": 8, "c.0.g.h": 9,
         "c.1": 10, "c.1.i": 11,

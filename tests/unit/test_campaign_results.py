@@ -17,7 +17,7 @@ import pytest
 from recorder.reader import Recording
 from replays.campaigns.equipment.bench import Target, validate_replay
 from replays.campaigns.evidence import Trial
-from replays.campaigns.files.campaign import load_campaign, shipped
+from replays.campaigns.files.campaign import find_shipped, load_campaign
 from replays.campaigns.files.case_results import CaseRecording
 from replays.campaigns.files.expectation import KINDS
 from replays.campaigns.files.run import end_device, measure_end
@@ -170,7 +170,7 @@ def test_a_run_stopped_early_fails_unless_expected(tmp_path: Path) -> None:
     end = {"event": "end", "reason": "stopped", "tick": 10_000, "time_s": 0.01}
     counts = make_counts("probes", np.zeros((200, 4)), None)
     recording = Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts}))
-    case = next(iter(load_campaign(shipped()["hammer"]).cases))
+    case = next(iter(load_campaign(find_shipped()["hammer"]).cases))
 
     def told(*events: dict[str, Any], **expected: Any) -> list[str]:
         trial, session = Trial("a", folder=tmp_path), CaseRecording(recording, tmp_path)

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 
 from drivers.can.analysis import PeriodicMessage, best_bits, worst_bits
 from drivers.can.bus import frame as frames
-from drivers.can.bus.frame import FD_LENGTHS, RECORD, Frame, make_record, records, sendable
+from drivers.can.bus.frame import FD_LENGTHS, RECORD, Frame, are_sendable, make_record, records
 from drivers.can.bus.timing import encode, frame_bits, speed
 from rig.base.errors import InputError
 
@@ -346,7 +346,7 @@ def test_frames_that_no_controller_sends(frame: Frame, why: str):
     array["identifier"][1] = word
     array["length"][1] = len(frame.data)
     array["flags"][1] = frames.FD * frame.fd + frames.BRS * frame.brs + frames.ESI * frame.esi
-    assert sendable(array.view(frames.RECORDS[64])).tolist() == [True, False]
+    assert are_sendable(array.view(frames.RECORDS[64])).tolist() == [True, False]
 
 
 def test_bit_rates():

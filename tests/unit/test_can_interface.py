@@ -153,7 +153,7 @@ def test_both_judges_of_frames_agree() -> None:
     for fd, width in itertools.product([False, True], [8, 64]):
         short = rows if width == 64 else frames.resize_records(rows, 8)
         one_by_one = [frames.find_fault(codec.Record(*row), fd=fd) is None for row in short.tolist()]
-        assert frames.sendable(short, fd=fd).tolist() == one_by_one
+        assert frames.are_sendable(short, fd=fd).tolist() == one_by_one
         assert 0 < sum(one_by_one) < len(rows)
 
 
@@ -446,7 +446,7 @@ def test_bus_off_is_reported_to_its_node_and_ends(rig: Rig) -> None:
 
 def test_a_node_that_is_bus_off_refuses_to_send(rig: Rig) -> None:
     sender: Any = rig.bus()
-    sender.receive([codec.Report(sender.node, 2, 0, 0, sender.done, 0)])
+    sender.receive([codec.NodeReport(sender.node, 2, 0, 0, sender.done, 0)])
     assert sender.state is BusState.ERROR
     with pytest.raises(can.CanOperationError, match="this node of can0 is bus off"):
         sender.send(message())

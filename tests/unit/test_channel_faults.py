@@ -235,7 +235,7 @@ def test_faults_of_a_scene_are_recorded_and_repeated_bit_by_bit(tmp_path: Any) -
     commands = scene_document(scene)["commands"]
     recording = recorded(tmp_path / "f.mcap", "stable-run", duration_s=0.3, commands=commands)
     assert validate(recording).bit_exact
-    assert Experiment.of(recording).faulty == {"P_E", "ring_x"}
+    assert Experiment.from_recording(recording).faulty_channels == {"P_E", "ring_x"}
     blind = validate(recording, blind=True)
     assert not blind.good
     assert blind.explained is not None

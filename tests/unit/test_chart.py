@@ -269,7 +269,7 @@ def test_a_table_of_an_earlier_version_is_read() -> None:
 
 
 def test_a_small_chart_resumes_and_lists_missing_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def chart(**changes: Any) -> session.Outcome:
+    def chart(**changes: Any) -> session.ChartOutcome:
         return make_chart(
             tmp_path / "out",
             panels=["exact"],
@@ -289,7 +289,7 @@ def test_a_small_chart_resumes_and_lists_missing_points(tmp_path: Path, monkeypa
 
     with monkeypatch.context() as patch:
         patch.setattr(figure, "draw", lambda *_arguments, **_options: [])
-        first = chart(progress=session.Progress(step=stop))
+        first = chart(progress=session.ChartProgress(step=stop))
     assert (first.interrupted, first.measured) == (True, 1)
     second = chart()
     assert not second.interrupted

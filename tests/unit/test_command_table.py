@@ -22,7 +22,7 @@ from drivers.console import Console
 from drivers.instruments.twins import TWINS
 from recorder.output.trigger import EVENT_NAMES
 from replays.campaigns.files.expectation import EventName
-from replays.recordings.identification.request import unit_of
+from replays.recordings.identification.request import fit_unit
 from rig.base.errors import InputError
 from rig.cli import app
 from rig.run import commands
@@ -227,7 +227,7 @@ def test_every_list_of_commands_follows() -> None:
     assert not {"fault", "clear"} & set(MECHANICAL)
     listed = {name: line for group in app.COMMANDS.values() for name, line in group.items()}
     assert {name: line for name, line in commands.SUMMARIES.items() if line}.items() <= listed.items()
-    assert all(unit_of(f"{name}.1.{field}") for name in COMMANDS for field in COMMANDS[name].quantities())
+    assert all(fit_unit(f"{name}.1.{field}") for name in COMMANDS for field in COMMANDS[name].quantities())
     assert [each.name for each in CanFieldNumber][:5] == ["NONE", "FORCE", "DURATION", "DIRECTION", "SPEED"]
 
 

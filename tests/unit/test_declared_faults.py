@@ -15,7 +15,7 @@ import pytest
 
 import recorder.session
 from recorder.contents.summary import Summary
-from recorder.output.disk_limits import Limits
+from recorder.output.disk_limits import DiskLimits
 from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording, join
 from recorder.rewrite import cut
@@ -175,7 +175,7 @@ def test_a_client_without_fault_events_reports_losses(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["dropout", "reorder-blocks", "stale-stamps", "restart"])
 def test_fault_events_work_across_files_and_triggers(kind: str, tmp_path: Path) -> None:
     items = simulate_messages(kind)
-    summary = recorded(tmp_path / "parts.mcap", kind, items, limits=Limits(rotate_s=0.13))
+    summary = recorded(tmp_path / "parts.mcap", kind, items, limits=DiskLimits(rotate_s=0.13))
     assert summary.good
     parts = join(list(summary.files))
     assert len(summary.files) == 4

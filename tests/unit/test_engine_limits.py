@@ -12,7 +12,7 @@ import pytest
 from recorder.reader import Recording
 from replays.recordings.export import write_run
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import bare
+from replays.recordings.resimulation.prediction import simplify
 from rig.base.errors import InputError
 from rig.physics.accuracy import QUANTITIES
 from rig.physics.engine_choice import MIN_LIMIT_TOLERANCE, SCALES, EngineChoice, Limits
@@ -164,10 +164,10 @@ def test_a_recording_keeps_its_limits_and_is_validated(capsys: pytest.CaptureFix
     assert "whirl angle off by" in printed
     assert "deg (limit 1e-09)" in printed
     recording = Recording.open(path)
-    experiment = Experiment.of(recording)
+    experiment = Experiment.from_recording(recording)
     assert {event["event"] for event in recording.events} >= {"hammer", "warning"}
     assert experiment.scene.engine.limits == Limits(radius_um=0.03, angle_deg=1e-9)
-    reduced = bare(experiment).scene.engine
+    reduced = simplify(experiment).scene.engine
     assert (reduced.limits.as_dict(), reduced.companion, reduced.tolerance) == ({}, False, 3e-3)
     run_for_output(capsys, "export", path, "-o", table)
     run_for_output(capsys, "import", table, "--template", mapping)

@@ -10,7 +10,7 @@ import pytest
 from replays.estimate.clock import fit_line, time_error
 from replays.estimate.intervals import chi2_mean_ends, chi2_quantile, draw_normal, jackknife
 from replays.estimate.least_squares import inverse_square, solve, solve_normal
-from replays.estimate.runs import block_means, split_at, true_runs
+from replays.estimate.runs import block_means, find_true_runs, split_at_breaks
 from replays.estimate.sine import fit_tones
 from replays.estimate.spectra import Spectrum, correlation, parabola_top, power, spectrum, transfer
 
@@ -81,8 +81,8 @@ def test_draws_have_the_covariance_though_sizes_are_apart() -> None:
 @pytest.mark.parametrize("rows", [500, 501])
 def test_a_filter_that_delays_moves_a_signal_of_any_number_of_rows(rows: int) -> None:
     turn = 2.0 * math.pi * 3.0 * np.arange(rows) / rows
-    signal = Spectrum.of(np.cos(turn), 1e-3)
-    late = signal.through(np.exp(-signal.turn * 5e-3))
+    signal = Spectrum.from_samples(np.cos(turn), 1e-3)
+    late = signal.apply_response(np.exp(-signal.turn * 5e-3))
     assert late == pytest.approx(np.cos(turn - 2.0 * math.pi * 15.0 / rows), abs=1e-12)
 
 
@@ -117,9 +117,9 @@ def test_two_tones_are_found_by_their_frequencies() -> None:
 
 
 def test_runs_pieces_and_blocks_of_rows() -> None:
-    assert true_runs(np.array([True, False, True, True, False])) == [(0, 1), (2, 4)]
-    assert true_runs(np.ones(3, bool)) == [(0, 3)]
-    assert true_runs(np.empty(0, bool)) == []
-    assert split_at(np.array([False, True, False])) == [(0, 2), (2, 4)]
+    assert find_true_runs(np.array([True, False, True, True, False])) == [(0, 1), (2, 4)]
+    assert find_true_runs(np.ones(3, bool)) == [(0, 3)]
+    assert find_true_runs(np.empty(0, bool)) == []
+    assert split_at_breaks(np.array([False, True, False])) == [(0, 2), (2, 4)]
     assert block_means(np.arange(7.0), 3).tolist() == [1.0, 4.0]
     assert len(block_means(np.arange(2.0), 3)) == 0

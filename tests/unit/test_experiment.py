@@ -60,7 +60,7 @@ def test_a_scene_with_a_deleted_parameter_file_is_repeated(tmp_path: Path) -> No
         tmp_path / "own.mcap", "hammer", {"parameters": str(own), "contact.restitution": 0.8, "duration_s": 0.2}
     )
     own.unlink()
-    experiment = Experiment.of(recording)
+    experiment = Experiment.from_recording(recording)
     parameters = experiment.scene.load_parameters()
     assert parameters.entries["contact.friction"].value == 0.3
     assert parameters.entries["contact.restitution"].value == 0.8
@@ -70,7 +70,7 @@ def test_a_scene_with_a_deleted_parameter_file_is_repeated(tmp_path: Path) -> No
 
 def test_a_parameter_set_of_the_rig_keeps_its_name(tmp_path: Path) -> None:
     recording = _record(tmp_path / "a.mcap", "drop", {"parameters": "as-printed", "duration_s": 0.05})
-    scene = Experiment.of(recording).scene
+    scene = Experiment.from_recording(recording).scene
     assert (scene.parameters, scene.set) == ("as-printed", {})
 
 
@@ -89,13 +89,13 @@ def test_a_recording_without_a_method_for_rolling_was_made_by_series() -> None:
 
 
 def test_changes_are_of_the_scene_or_its_parameters(tmp_path: Path) -> None:
-    experiment = Experiment.of(_record(tmp_path / "a.mcap", "hammer", {"duration_s": 0.05}))
-    changed = experiment.changed({"contact.friction": 0.2, "engine.name": "rk8", "seed": 5})
+    experiment = Experiment.from_recording(_record(tmp_path / "a.mcap", "hammer", {"duration_s": 0.05}))
+    changed = experiment.with_changes({"contact.friction": 0.2, "engine.name": "rk8", "seed": 5})
     assert changed.scene.set == {"contact.friction": 0.2}
     assert (changed.scene.engine.name, changed.scene.seed) == ("rk8", 5)
     assert changed.scene.engine.tolerance > 0.0, "another engine comes with its own tolerance"
     with pytest.raises(InputError, match=r"contact\.fricton must be a field"):
-        experiment.changed({"contact.fricton": 0.2})
+        experiment.with_changes({"contact.fricton": 0.2})
 
 
 def test_commands_from_before_and_during_a_live_recording(tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_commands_from_before_and_during_a_live_recording(tmp_path: Path) -> Non
     recording_thread.join(timeout=60)
 
     recording = Recording.open(tmp_path / "live.mcap")
-    experiment = Experiment.of(recording)
+    experiment = Experiment.from_recording(recording)
     assert [(command.tick, command.name) for command in experiment.commands] == [
         (50_000, "hammer"),
         (250_000, "speed"),

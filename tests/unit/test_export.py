@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.export import SUFFIXES, check_run_output, table_columns, writer_for
+from replays.recordings.export import SUFFIXES, check_run_output, make_writer, table_columns
 from replays.recordings.verdict import stream_rows
 from rig.base.errors import DiskError, InputError
 from rig.cli.main import main
@@ -142,7 +142,7 @@ def test_existing_file_is_replaced_only_by_force(suffix: str, tmp_path: Path) ->
     path = tmp_path / f"run{suffix}"
     path.write_text("precious")
     with pytest.raises(InputError, match=r"^output must be a new file \(--force replaces one\)"):
-        writer_for(path, Simulation(load_scene("drop")))
+        make_writer(path, Simulation(load_scene("drop")))
     assert path.read_text() == "precious"
     with pytest.raises(SystemExit) as end:
         main(["simulate", "drop", "-o", str(path), "--duration-s", "0.01", "--force"])
@@ -175,7 +175,7 @@ class WriteError(Exception):
 def test_interrupted_writer_leaves_nothing(suffix: str, error: type[BaseException], tmp_path: Path) -> None:
     path = tmp_path / f"run{suffix}"
     simulation = Simulation(load_scene("drop"))
-    with pytest.raises(error), writer_for(path, simulation) as writer:  # noqa: PT012
+    with pytest.raises(error), make_writer(path, simulation) as writer:  # noqa: PT012
         for n, frame in enumerate(frames(simulation)):
             writer.write(frame)
             (made,) = tmp_path.iterdir()  # being written, under another name
@@ -191,7 +191,7 @@ def test_interrupted_writer_keeps_the_existing_file(suffix: str, tmp_path: Path)
     path = tmp_path / f"run{suffix}"
     path.write_text("precious")
     simulation = Simulation(load_scene("drop"))
-    with pytest.raises(WriteError), writer_for(path, simulation, force=True) as writer:  # noqa: PT012
+    with pytest.raises(WriteError), make_writer(path, simulation, force=True) as writer:  # noqa: PT012
         writer.write(simulation.advance(50_000))
         raise WriteError
     assert path.read_text() == "precious"
@@ -208,7 +208,7 @@ def test_a_disk_error_is_reported_and_leaves_no_file(
     def refuse(rows: np.ndarray) -> None:
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(DiskError, match="No space left"), writer_for(path, simulation) as writer:  # noqa: PT012
+    with pytest.raises(DiskError, match="No space left"), make_writer(path, simulation) as writer:  # noqa: PT012
         monkeypatch.setattr(writer, "_append", refuse)
         for frame in frames(simulation, chunk_s=0.01):
             writer.write(frame)

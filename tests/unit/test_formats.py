@@ -165,7 +165,9 @@ def test_an_export_with_events_is_imported_again(suffix: str, noted: Recording, 
         assert end.value.code == 0
     found = Recording.open(again)
     if suffix != ".uff":
-        commands = [{"at_s": one.at_s, **one.request.model_dump()} for one in Experiment.of(found).scene.commands]
+        commands = [
+            {"at_s": one.at_s, **one.request.model_dump()} for one in Experiment.from_recording(found).scene.commands
+        ]
         assert commands[1:] == [{"at_s": 0.05, "command": "speed", "speed_hz": 5.2}], "what was sent is the scene's own"
     np.testing.assert_allclose(found.samples("probes").values, noted.samples("probes").values, rtol=0, atol=1e-6)
     assert len(json.dumps(found.scene["import"]["files"])) < 3_000, "without the rig's documents"
@@ -391,7 +393,7 @@ def test_wav_by_scipy_and_the_wave_module(recording: Recording, tmp_path: Path) 
 def test_volts_equal_the_converter_input(recording: Recording, tmp_path: Path) -> None:
     selection, _ = written(recording, tmp_path / "x.parquet", "disk_x", unit="volts")
     table = selection.tables[0]
-    volts = np.concatenate([table.exported(0, chunk) for chunk in selection.chunks(table)])
+    volts = np.concatenate([table.convert_column(0, chunk) for chunk in selection.chunks(table)])
     channel = recording.table.channels["disk_x"]
     mm = recording.samples("probes")["disk_x"]
     np.testing.assert_allclose(volts, channel.bias_v + channel.sensitivity_v * mm, rtol=0, atol=1e-12)
@@ -541,7 +543,7 @@ def test_a_package_that_a_format_needs_is_named(
 def test_polyphase_reproduces_a_tone(rate_hz: float, target_hz: float) -> None:
     """Compared with the closed form: a tone in the pass band, at instants between samples, within 90 dB."""
     tone_hz = 0.8 * clock.PASS_BAND * min(rate_hz, target_hz) / 2
-    axis = clock.Axis(0.0131, rate_hz, round(rate_hz * 0.4))
+    axis = clock.TimeAxis(0.0131, rate_hz, round(rate_hz * 0.4))
     values = 3.0 + np.sin(2 * np.pi * tone_hz * axis.instants())
     first_s, rows = 0.0131 + 0.1234567, 3000
     found = clock.resample_polyphase(values, axis, first_s, target_hz, rows)
@@ -550,7 +552,7 @@ def test_polyphase_reproduces_a_tone(rate_hz: float, target_hz: float) -> None:
 
 
 def test_polyphase_suppresses_aliases() -> None:
-    axis = clock.Axis(0.0, 20_000.0, 20_000)
+    axis = clock.TimeAxis(0.0, 20_000.0, 20_000)
     tone = np.sin(2 * np.pi * 2_600.0 * axis.instants())
     found = clock.resample_polyphase(tone, axis, 0.1, 5_000.0, 4_000)
     assert np.abs(found).max() < 1e-4

@@ -12,7 +12,7 @@ import pytest
 from recorder.reader import Recording
 from replays.recordings.formats import clock
 from replays.recordings.formats.conversion import Conversion, block_starts, convert, write_recording
-from replays.recordings.formats.events.motion import Motion, estimate_speed
+from replays.recordings.formats.events.motion import ChannelMotion, estimate_speed
 from replays.recordings.formats.guessing import noise, overview
 from replays.recordings.formats.guessing.guess import Guess
 from replays.recordings.formats.guessing.naming import read_name
@@ -59,8 +59,8 @@ def test_names_in_many_languages(name: str, kind: str, place: str, axis: str, si
 
 
 def test_the_o_of_compass_points_is_recognised_from_the_others() -> None:
-    assert read_name("Kraft O").side_among({"N", "S", "W", "O"}) == "E"
-    assert read_name("Effort O").side_among({"N", "S", "E", "O"}) == "W"
+    assert read_name("Kraft O").resolve_side({"N", "S", "W", "O"}) == "E"
+    assert read_name("Effort O").resolve_side({"N", "S", "E", "O"}) == "W"
 
 
 LOGS = {
@@ -90,14 +90,14 @@ def test_each_signal_is_guessed_correctly(
         np.testing.assert_allclose(found[channel].features.values, values, rtol=0, atol=1e-9)
     assert text.count(CHECK) == LINES_TO_CHECK[path.name]
     named = path.name in ("m.mf4", "g.csv")
-    assert all(guess.sure == "sure" for guess in guesses) == named
+    assert all(guess.confidence == "sure" for guess in guesses) == named
     if not named:
         assert "90° from" in found["disk_x"].why
         assert "pairs move 1.6:1, the disk more" in found["ring_x"].why
     if path.name == "c.csv":
-        assert (found["speed"].unit, found["speed"].sure) == ("rpm", "likely")
+        assert (found["speed"].unit, found["speed"].confidence) == ("rpm", "likely")
         assert "against CH8; loaded as CH4 rises" in found["P_N"].why
-        assert found["P_N"].sure == "ask"
+        assert found["P_N"].confidence == "ask"
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_a_signal_without_evidence_remains_an_unknown_channel(
     head = ",".join(["time", *names])
     np.savetxt(path, np.column_stack([t, 5.0 + noise_of]), delimiter=",", header=head, comments="", fmt="%.9f")
     text, guesses = guess_mapping([path])
-    assert tuple(f"{one.channel} {one.sure}" if one.channel else "" for one in guesses) == channels
+    assert tuple(f"{one.channel} {one.confidence}" if one.channel else "" for one in guesses) == channels
     conversion, _ = imported(path, text, tmp_path)
     assert len(conversion.channels) == len(names)
 
@@ -266,7 +266,7 @@ def test_blocks_begin_nearest_to_a_tick(rate: float) -> None:
 
 def test_resampling_gains_are_those_of_the_filters() -> None:
     generator = np.random.default_rng(0)
-    values, axis = generator.standard_normal(60_000), clock.Axis(0.0, 1000.0, 60_000)
+    values, axis = generator.standard_normal(60_000), clock.TimeAxis(0.0, 1000.0, 60_000)
     for rate in (999.0, 400.0):
         instants = np.arange(round(59.0 * rate)) / rate
         straight = clock.interpolate_linear(values, axis, instants)
@@ -354,10 +354,12 @@ def test_wrong_input_is_refused_in_one_line(
 
 @pytest.mark.parametrize("missing", [("disk_x",), ("disk_y",), ("disk_x", "disk_y"), ()])
 def test_a_channel_without_a_number_does_not_turn(missing: tuple[str, ...]) -> None:
-    axis = clock.Axis(first_s=0.0, rate_hz=2000.0, rows=40_000)
+    axis = clock.TimeAxis(first_s=0.0, rate_hz=2000.0, rows=40_000)
     angle = 2.0 * np.pi * 6.2 * axis.instants()
     signals = {"disk_x": np.cos(angle), "disk_y": np.sin(angle)}
-    motions = [Motion(name, np.full(axis.rows, np.nan) if name in missing else x, axis) for name, x in signals.items()]
+    motions = [
+        ChannelMotion(name, np.full(axis.rows, np.nan) if name in missing else x, axis) for name, x in signals.items()
+    ]
     found = estimate_speed(motions)
     if len(missing) == 2:
         assert found is None

@@ -16,7 +16,7 @@ from replays.recordings.export import write_run
 from replays.recordings.identification import ask, identify
 from replays.recordings.identification.horizon import find_horizon
 from replays.recordings.identification.judgement import Finding, widen_interval
-from replays.recordings.identification.request import measured_noise
+from replays.recordings.identification.request import measure_noise
 from replays.recordings.identification.window import Window
 from replays.recordings.resimulation.experiment import Experiment
 from rig.base.errors import InputError
@@ -83,7 +83,9 @@ def test_bounds_decide_which_values_are_identified(file: Path) -> None:
     recording = Recording.open(file)
 
     def half_width(given: dict[str, tuple[float, float]]) -> tuple[str, float]:
-        question = ask(recording, Experiment.of(recording), ["magnet.stiffness"], window=(0.0, 0.015), bounds=given)
+        question = ask(
+            recording, Experiment.from_recording(recording), ["magnet.stiffness"], window=(0.0, 0.015), bounds=given
+        )
         finding = identify(question).judgement.findings[0]
         return finding.standing, finding.half_width
 
@@ -94,7 +96,7 @@ def test_bounds_decide_which_values_are_identified(file: Path) -> None:
 
 def test_an_interval_wider_than_the_prior_is_no_result(file: Path) -> None:
     recording = Recording.open(file)
-    (unknown,) = ask(recording, Experiment.of(recording), ["hammer.1.force_n"]).unknowns
+    (unknown,) = ask(recording, Experiment.from_recording(recording), ["hammer.1.force_n"]).unknowns
     finding = Finding(unknown, 110.0, 1.0, "identified", "identified")
     wider = widen_interval(finding, 20.0)
     assert (wider.standing, wider.half_width) == ("identified", 21.0)
@@ -105,7 +107,7 @@ def test_an_interval_wider_than_the_prior_is_no_result(file: Path) -> None:
 
 def test_a_prior_narrows_the_interval_as_two_measurements_do(file: Path) -> None:
     recording = Recording.open(file)
-    experiment = Experiment.of(recording)
+    experiment = Experiment.from_recording(recording)
     ask_for = {"keys": ["magnet.stiffness"], "window": (0.0, 0.01), "channels": ["disk_x"]}
     alone = identify(ask(recording, experiment, **ask_for)).judgement.findings[0].half_width
     prior = {"magnet.stiffness": (1.7, alone / 1.96)}
@@ -115,7 +117,7 @@ def test_a_prior_narrows_the_interval_as_two_measurements_do(file: Path) -> None
 
 def test_lost_samples_are_left_out(file: Path) -> None:
     recording = Recording.open(file)
-    question = ask(recording, Experiment.of(recording), ["contact.friction"])
+    question = ask(recording, Experiment.from_recording(recording), ["contact.friction"])
     whole = Window(question, 0.03)
     question.observation.values[100:120, 3] = np.nan
     window = Window(question, 0.03)
@@ -127,7 +129,7 @@ def test_lost_samples_are_left_out(file: Path) -> None:
 
 def test_the_window_is_shorter_for_less_certain_starts(file: Path) -> None:
     recording = Recording.open(file)
-    question = ask(recording, Experiment.of(recording), ["magnet.stiffness", "contact.restitution"])
+    question = ask(recording, Experiment.from_recording(recording), ["magnet.stiffness", "contact.restitution"])
     window = Window(question, 0.035)
     vague, sharp = (find_horizon(window, np.zeros(2), np.diag([size, size]) ** 2) for size in (0.1, 1e-5))
     assert not vague.whole
@@ -169,16 +171,16 @@ def test_no_truth_is_read(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Recording, "truth", refuse)
     recording = Recording.open(file)
-    ask(recording, Experiment.of(recording), ["contact.friction"])
+    ask(recording, Experiment.from_recording(recording), ["contact.friction"])
     with pytest.raises(InputError, match="different keys"):
-        ask(recording, Experiment.of(recording), [])
+        ask(recording, Experiment.from_recording(recording), [])
 
 
 def test_outliers_have_less_weight(file: Path) -> None:
     recording = Recording.open(file)
     errors = []
     for robust in (False, True):
-        question = ask(recording, Experiment.of(recording), ["magnet.stiffness"], window=(0.0, 0.02))
+        question = ask(recording, Experiment.from_recording(recording), ["magnet.stiffness"], window=(0.0, 0.02))
         question.observation.values[50:400:35, 3] += 200.0 * question.observation.noise[3]
         finding = identify(question, robust=robust).judgement.findings[0]
         errors.append(abs(finding.value - 1.7))
@@ -207,7 +209,7 @@ def test_a_wrong_model_yields_no_value(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(("lacking", "widened"), [(0.0, False), (0.8, True)])
 def test_a_small_misfit_widens_the_intervals_by_its_size(lacking: float, widened: bool, file: Path) -> None:
     recording = Recording.open(file)
-    question = ask(recording, Experiment.of(recording), ["magnet.stiffness"], window=(0.0, 0.025))
+    question = ask(recording, Experiment.from_recording(recording), ["magnet.stiffness"], window=(0.0, 0.025))
     times_s, noise = question.observation.times_s, question.observation.noise
     question.observation.values[:, :4] += np.sin(2e3 * times_s)[:, None] * lacking * noise[:4]
     judged = identify(question).judgement
@@ -228,7 +230,7 @@ def test_a_log_without_a_scene_uses_a_given_scene(file: Path, capsys: pytest.Cap
 def test_noise_is_measured_if_the_table_has_none() -> None:
     noise = np.random.default_rng(1).normal(0.0, 0.02, 4000)
     smooth = np.sin(np.linspace(0.0, 30.0, 4000))
-    assert measured_noise(smooth + noise) == pytest.approx(0.02, rel=0.1)
+    assert measure_noise(smooth + noise) == pytest.approx(0.02, rel=0.1)
 
 
 def test_samples_starting_after_the_impacts_are_refused(tmp_path: Path) -> None:
@@ -236,7 +238,9 @@ def test_samples_starting_after_the_impacts_are_refused(tmp_path: Path) -> None:
     simulation = Simulation(load_scene("hammer", {"duration_s": 0.3}))
     write_run(simulation, path)
     recording = Recording.open(path)
-    question = ask(recording, Experiment.of(recording), ["contact.friction", "magnet.stiffness"], window=(0.25, 0.3))
+    question = ask(
+        recording, Experiment.from_recording(recording), ["contact.friction", "magnet.stiffness"], window=(0.25, 0.3)
+    )
     with pytest.raises(InputError, match="before the first contacts"):
         identify(question)
 
@@ -266,7 +270,7 @@ def test_nuisance_values_do_not_lengthen_the_window(quiet: Path) -> None:
 
     def end_s(along: tuple[str, ...]) -> float:
         keys = ["magnet.stiffness", "contact.friction"]
-        question = ask(recording, Experiment.of(recording), keys, window=(0.0, 0.3), nuisances=along)
+        question = ask(recording, Experiment.from_recording(recording), keys, window=(0.0, 0.3), nuisances=along)
         return identify(question, precision=1e-2).window.end_s
 
     assert end_s(()) == pytest.approx(0.3, abs=1e-3)

@@ -110,7 +110,7 @@ def test_text_with_semicolons_and_decimal_commas(daq_text: tuple[Path, np.ndarra
     assert recording.scene["import"]["mapping"]["channels"]["ring_x"]["sign"] == -1
     assert recording.events[0]["event"] == "import"
     with pytest.raises(InputError, match=r"scene it ran: add \[experiment\] to the mapping"):
-        Experiment.of(recording)
+        Experiment.from_recording(recording)
 
 
 @pytest.mark.parametrize(
@@ -600,10 +600,10 @@ def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         force["P_E"][inside], 50.0 * np.sin(100 * (force.times_s + zero_s))[inside], rtol=0, atol=1e-4
     )
-    (timed,) = Experiment.of(recording).scene.commands
+    (timed,) = Experiment.from_recording(recording).scene.commands
     assert timed.at_s == pytest.approx(0.2, abs=1e-4)
     assert timed.at_s + zero_s == pytest.approx(0.5 - 2.5e-3, abs=1e-4)  # time zero is inside the log
-    assert Experiment.of(recording).scene.drive.speed_hz == pytest.approx(6.2, rel=1e-3)
+    assert Experiment.from_recording(recording).scene.drive.speed_hz == pytest.approx(6.2, rel=1e-3)
     assert recording.samples("bearing").names == ("oil_temperature",)
 
 
@@ -687,7 +687,7 @@ def test_a_hammer_pulse_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
     path = hammer_log(tmp_path / "x.csv", at_s=0.73211, force_n=87.0, duration_s=6.5e-3)
     conversion, recording = imported(tmp_path, [path], HAMMER_MAPPING)
     assert len(conversion.pulses) == 1
-    experiment = Experiment.of(recording)
+    experiment = Experiment.from_recording(recording)
     # The rig ran before: the simulation starts at the first sample, with any angle of the shaft.
     assert experiment.begin is not None
     assert (experiment.first_s, experiment.begin.tick) == (0.0, 0)
@@ -743,7 +743,7 @@ def test_export_and_import_reproduce_the_values(
     a, b = Recording.open(source), Recording.open(back)
     assert list(b.table.groups) == list(a.table.groups)
     if suffix != ".uff":  # that format cannot hold the scene
-        assert Experiment.of(b).scene == Experiment.of(a).scene
+        assert Experiment.from_recording(b).scene == Experiment.from_recording(a).scene
         assert b.table.channels["inner_x"].bandwidth_hz == a.table.channels["inner_x"].bandwidth_hz
     for name in a.table.groups:
         ours, theirs = a.samples(name), b.samples(name)
@@ -792,7 +792,7 @@ def test_units(unit_from: str, unit_to: str, expected: float) -> None:
 def test_hysteresis_keeps_noise_from_making_edges() -> None:
     t = np.arange(10_000) / 10_000
     signal = np.sin(2 * np.pi * 5 * t - 1.0) + 0.02 * np.sin(2 * np.pi * 3001 * t)
-    axis = clock.Axis(0.0, 10_000.0, len(t))
+    axis = clock.TimeAxis(0.0, 10_000.0, len(t))
     found, _ = clock.find_crossings(signal, axis, threshold=0.0, hysteresis=0.2)
     np.testing.assert_allclose(found, (np.arange(5) + 0.5 / np.pi) / 5, atol=2e-3)
     assert len(clock.find_crossings(signal, axis, threshold=0.0, hysteresis=0.0)[0]) > len(found)
@@ -1010,11 +1010,11 @@ def test_a_template_lists_the_other_signals(daq_mdf: Path, tmp_path: Path, capsy
 
 
 def test_a_json_comment_is_recognised_by_its_label(tmp_path: Path) -> None:
-    from replays.recordings.formats.guessing.template import label_of
+    from replays.recordings.formats.guessing.template import shorten_label
     from replays.recordings.formats.source import Entry
 
-    assert label_of(Entry("x", "", "mm", 1, None, label="{\n  of two lines")) == "{ of two lines"
-    assert label_of(Entry("x", "", "mm", 1, None, label="long " * 20)).endswith("...")
+    assert shorten_label(Entry("x", "", "mm", 1, None, label="{\n  of two lines")) == "{ of two lines"
+    assert shorten_label(Entry("x", "", "mm", 1, None, label="long " * 20)).endswith("...")
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,10 @@ import pytest
 
 from replays.studies.common.run import Timed, run_scene
 from replays.studies.ladder.chart import draw
-from replays.studies.ladder.document import ladder_document, pick_of
+from replays.studies.ladder.document import ladder_document, make_pick
 from replays.studies.ladder.measurement import Candidate, Measurement, measure
 from replays.studies.ladder.pick import with_pick, write_pick
-from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, ending, parse_quantities
+from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, find_ending, parse_quantities
 from replays.studies.ladder.search import LEVELS, MIN_SAVING, Ladder, search
 from rig.base.errors import InputError
 from rig.cli.commands.ladder import engines_table, levels_table
@@ -91,10 +91,10 @@ def test_quantities_read_closed_forms() -> None:
     for name, value in expected.items():
         assert QUANTITIES[name].read(turning) == pytest.approx(value, rel=1e-6), name
     assert QUANTITIES["outcome"].read(turning) == "backward whirl"
-    assert ending(turning).word == "rolling backward whirl"
+    assert find_ending(turning).word == "rolling backward whirl"
     noise = np.linspace(-1e-12, 1e-12, 1000)
     standing = trace(contact_impulse=t, ring_y=-np.ones(1000), sliding_speed=noise, theta_rate=0.1 * noise)
-    assert (ending(standing).word, ending(standing).rolling_share) == ("resting", 1.0)
+    assert (find_ending(standing).word, find_ending(standing).rolling_share) == ("resting", 1.0)
     apart = trace(penetration=-np.ones(100), ring_x=np.ones(100))
     assert QUANTITIES["outcome"].read(apart) == "no contact"
     assert math.isnan(QUANTITIES["whirl_frequency"].read(apart))
@@ -126,7 +126,7 @@ WHIRL = Ending(touches=True, contact_share=1.0, turns=-40.0, rolling_share=1.0)
 )
 def test_outcomes_have_a_name_and_soft_limits(change: dict[str, float], word: str, alike: bool) -> None:
     other = WHIRL._replace(**change)
-    assert (other.word, WHIRL.alike(other), other.alike(WHIRL)) == (word, alike, alike)
+    assert (other.word, WHIRL.is_alike(other), other.is_alike(WHIRL)) == (word, alike, alike)
 
 
 def test_time_to_roll_detects_every_slip() -> None:
@@ -214,7 +214,7 @@ def test_a_level_that_saves_less_than_a_tenth_is_kept(monkeypatch: pytest.Monkey
 
 def test_a_stored_choice_has_no_companion_and_an_old_one_the_scenes(found: Ladder) -> None:
     assert (found.given.candidate.companion, found.picked.candidate.companion) == (True, False)
-    pick = pick_of(found).model_copy(update={"engine": "split", "step_us": 25, "engine_tolerance": 3e-4})
+    pick = make_pick(found).model_copy(update={"engine": "split", "step_us": 25, "engine_tolerance": 3e-4})
     for companion, has in ((pick.companion, False), (None, True)):
         applied = pick.model_copy(update={"companion": companion}).apply({})
         assert parse_scene(applied).engine.companion == has
@@ -263,7 +263,7 @@ def test_document_and_pictures_contain_the_evidence(found: Ladder, tmp_path: Pat
 
 
 def test_a_stored_choice_is_applied_with_a_message(found: Ladder, path: Path) -> None:
-    pick = pick_of(found)
+    pick = make_pick(found)
     write_pick(path, str(path), pick)
     text = path.read_text(encoding="utf-8")
     assert text.startswith(SCENE.rstrip())
@@ -287,7 +287,7 @@ def test_a_stored_choice_is_applied_with_a_message(found: Ladder, path: Path) ->
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_only_the_table_is_replaced(found: Ladder, end: str) -> None:
-    pick = pick_of(found)
+    pick = make_pick(found)
     once = with_pick(SCENE.replace("\n", end), pick)
     assert with_pick(once, pick) == once
     assert once.count("[pick]") == 1
@@ -305,7 +305,7 @@ def test_only_the_table_is_replaced(found: Ladder, end: str) -> None:
 
 def test_text_that_hides_a_choice_is_not_changed(found: Ladder) -> None:
     with pytest.raises(InputError, match="--write"):
-        with_pick('title = """\n[pick]\n"""\n', pick_of(found))
+        with_pick('title = """\n[pick]\n"""\n', make_pick(found))
 
 
 @pytest.mark.parametrize(
@@ -317,17 +317,17 @@ def test_text_that_hides_a_choice_is_not_changed(found: Ladder) -> None:
     ],
 )
 def test_a_stale_pick_is_refused(found: Ladder, path: Path, change: dict[str, float], what: str) -> None:
-    write_pick(path, str(path), pick_of(found))
+    write_pick(path, str(path), make_pick(found))
     with pytest.raises(InputError, match=f"picked again .*{what} changed since the pick"):
         load_scene(path, dict(change))
     load_scene(path, {**change, "fidelity": "given"})
 
 
 def test_changed_equations_and_choices_by_hand_are_refused(found: Ladder, path: Path) -> None:
-    write_pick(path, str(path), pick_of(found).model_copy(update={"code_digest": "0" * 16}))
+    write_pick(path, str(path), make_pick(found).model_copy(update={"code_digest": "0" * 16}))
     with pytest.raises(InputError, match="equations or engines changed"):
         load_scene(path)
-    write_pick(path, str(path), pick_of(found))
+    write_pick(path, str(path), make_pick(found))
     with pytest.raises(InputError, match=r"where engine\.name is chosen by hand"):
         load_scene(path, {"engine.name": "rk4"})
     load_scene(path, {"seed": 7})  # of the sensors' noise: no part of the physics

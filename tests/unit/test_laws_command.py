@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from replays.studies.laws import compare, draw, returned_over_speeds
+from replays.studies.laws import compare, draw, restitution_curves
 from rig.cli.main import main
 from rig.physics.contacts import DAMPING, KELVIN_VOIGT, STIFFNESS
 from rig.physics.parameters import load_parameters
@@ -88,7 +88,7 @@ def test_an_inapplicable_law_is_marked(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_only_memory_of_v0_and_linear_laws_forget_the_speed() -> None:
-    over = returned_over_speeds(DEFAULT, [1e-4, 1e-2, 0.145, 1.0])
+    over = restitution_curves(DEFAULT, [1e-4, 1e-2, 0.145, 1.0])
     assert over["memory of v0 (exact)"][1:] == pytest.approx([0.9] * 3, abs=1e-9)
     assert over["memory of v0 (exact)"][0] > 0.98
     assert over["Kelvin-Voigt"] == pytest.approx([0.9] * 4, abs=1e-6)

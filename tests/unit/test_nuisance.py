@@ -17,7 +17,7 @@ from replays.recordings.identification.agreement import solve_weighted
 from replays.recordings.identification.log import identify_log
 from replays.recordings.identification.nuisance import find_nuisances, tune
 from replays.recordings.resimulation.experiment import Experiment, is_imported
-from replays.recordings.resimulation.sensitivity import ANGLE, value_of, with_values
+from replays.recordings.resimulation.sensitivity import ANGLE, get_value, with_values
 from replays.recordings.validation import load_criteria, validate
 from replays.recordings.validation.explanations.signals import edge_faults
 from rig.base.errors import InputError
@@ -116,15 +116,15 @@ def test_the_second_rig_is_one_of_this_kind(motion: second_rig.Motion) -> None:
 
 
 def test_a_log_of_a_part_of_a_run_is_resumed_before_the_pulse(mils: Recording) -> None:
-    experiment = Experiment.of(mils)
+    experiment = Experiment.from_recording(mils)
     assert is_imported(mils)
     assert experiment.begin is not None
     assert (experiment.first_s, experiment.begin.tick) == (0.0, 300_000)
-    assert value_of(experiment, "hammer.1.at_s") == pytest.approx(0.8, abs=2e-4)
+    assert get_value(experiment, "hammer.1.at_s") == pytest.approx(0.8, abs=2e-4)
 
 
 def test_values_missing_in_a_log_are_estimated(mils: Recording, motion: second_rig.Motion) -> None:
-    found = tune(mils, Experiment.of(mils))
+    found = tune(mils, Experiment.from_recording(mils))
     fitted = {one.key: one.value for one in found.fitted}
     assert max(found.scales.values()) < 1.2
     assert fitted["drive.speed_hz"] == pytest.approx(6.2, abs=1e-3)
@@ -141,10 +141,10 @@ def test_values_missing_in_a_log_are_estimated(mils: Recording, motion: second_r
 
 
 def test_a_clock_is_no_number_of_the_experiment(mils: Recording) -> None:
-    experiment = Experiment.of(mils)
+    experiment = Experiment.from_recording(mils)
     assert with_values(experiment, {"clock.offset_s": 1e-3, "clock.rate_ppm": 3.0}) == experiment
     turned = with_values(experiment, {ANGLE: 0.5, "drive.speed_hz": experiment.scene.drive.speed_hz + 0.01})
-    ahead = value_of(turned, "shaft.unbalance_phase") - value_of(experiment, "shaft.unbalance_phase")
+    ahead = get_value(turned, "shaft.unbalance_phase") - get_value(experiment, "shaft.unbalance_phase")
     assert ahead == pytest.approx(0.5)
 
 
@@ -238,7 +238,7 @@ def test_unpredicted_pulses_are_no_fault(motion: second_rig.Motion, tmp_path: Pa
     mapping = "".join(f"[channels.{one}" for one in channels if one.partition("]")[0] in few)
     (told := tmp_path / "told").mkdir()
     recording = import_log(told, columns, keyphasor + mapping)
-    begin, (before, *_) = Experiment.of(recording).begin, recording.edges()
+    begin, (before, *_) = Experiment.from_recording(recording).begin, recording.edges()
     assert begin is not None
     assert math.remainder(begin.angle + 2.0 * math.pi * 6.2 * before, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-3)
     assert validate(import_log(tmp_path, columns, mapping)).good
@@ -262,7 +262,7 @@ def test_contact_parameters_are_identified_from_a_part_of_a_run(tmp_path: Path) 
     motion = second_rig.simulate_pulse(second_rig.Rig(mu=0.235), turned=1.0, before_s=0.2, after_s=0.06, settled_s=1.5)
     recording, rules = import_all_channels(tmp_path, motion, seed=5), load_criteria().imported
     found = identify_log(
-        recording, Experiment.of(recording), tuple(TRUTH), variants=[one.set for one in rules.variants],
+        recording, Experiment.from_recording(recording), tuple(TRUTH), variants=[one.set for one in rules.variants],
         bandwidth=rules.bandwidth, start={"contact.restitution": 0.8},
     )  # fmt: skip
     assert found.judgement.fits
@@ -314,7 +314,7 @@ def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
             folder, motion, seed=seed, case=faulty_logs.Case("", "", ppm=rng.uniform(-80.0, 80.0))
         )  # fmt: skip
         found = identify_log(
-            recording, Experiment.of(recording), FIVE, variants=[one.set for one in rules.variants],
+            recording, Experiment.from_recording(recording), FIVE, variants=[one.set for one in rules.variants],
             bandwidth=rules.bandwidth,
         )  # fmt: skip
         findings = {one.unknown.key: one for one in found.judgement.findings}
@@ -335,7 +335,7 @@ def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> Non
     motion = second_rig.simulate_pulse(second_rig.Rig(**wrong), turned=1.0, settled_s=1.5, after_s=0.1)
     recording, rules = import_all_channels(tmp_path, motion, seed=3), load_criteria().imported
     found = identify_log(
-        recording, Experiment.of(recording), ("contact.friction", "magnet.stiffness"),
+        recording, Experiment.from_recording(recording), ("contact.friction", "magnet.stiffness"),
         variants=[one.set for one in rules.variants], bandwidth=rules.bandwidth,
     )  # fmt: skip
     for finding, truth in zip(found.judgement.findings, (0.25, 1.7), strict=False):

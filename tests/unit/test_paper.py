@@ -17,11 +17,11 @@ import pytest
 
 from replays.report import write_report
 from replays.report.document import Heading, Paragraph, Picture, Report, Table
-from replays.studies.paper.claim import CORRECTIONS, Bar, bars, claim_groups, correction_keys, toward_measured
-from replays.studies.paper.document import in_print, write_up
+from replays.studies.paper.claim import CORRECTIONS, Bar, bars, claim_groups, correction_keys, select_lower_ends
+from replays.studies.paper.document import typeset, write_up
 from replays.studies.paper.figures.figure import first_impacts
-from replays.studies.paper.findings import Findings, find, planned_groups, steps
-from replays.studies.paper.scans.pulse import PULSE_AT, Outcome, Pulse, outcome, outcomes
+from replays.studies.paper.findings import Findings, find, list_groups, steps
+from replays.studies.paper.scans.pulse import PULSE_AT, Pulse, PulseRun, outcome, outcomes
 from replays.studies.paper.scans.spread import (
     assumed_values,
     changes,
@@ -160,12 +160,12 @@ def test_corrections_are_where_the_sets_differ():
 
 
 def test_tornado_is_sorted_by_width_and_marks_the_measured_value():
-    blank = Outcome("backward whirl", reaction_x_n=540.0)
+    blank = PulseRun("backward whirl", reaction_x_n=540.0)
     results = {name: [blank] for name in claim_groups(ensemble=1)}
-    results["low shaft.radius"] = [Outcome("backward whirl", reaction_x_n=350.0)]
+    results["low shaft.radius"] = [PulseRun("backward whirl", reaction_x_n=350.0)]
     found = bars(results, "reaction_x_n")
     assert found[0] == Bar("shaft radius", "assumed value", (350.0, 540.0, 540.0))
-    assert toward_measured(found) == found[:1]
+    assert select_lower_ends(found) == found[:1]
     assert {entry.called for entry in free_values()} <= {bar.name for bar in found}
     assert {entry.key for entry, _, _ in one_at_a_time()} == {entry.key for entry in free_values()}
 
@@ -199,7 +199,7 @@ def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list
     assert len(claims_of["stiff_force"]) == 3 * 3 * few > 9, "three houses and three readings of each sample"
     assert len(claims_of["house_raises"]) == few
     assert spread["drop_amplified"] == 2 * spread["drop_reaction"] > 2, "two readings of each sample"
-    assert all(len(findings.results[name]) == len(group) for name, group in planned_groups(quick=True).items())
+    assert all(len(findings.results[name]) == len(group) for name, group in list_groups(quick=True).items())
 
 
 @pytest.fixture(scope="module")
@@ -307,8 +307,8 @@ def test_number():
 def test_symbols_powers_and_signs_are_set_as_in_print():
     words = "R_S/r_0 of house.k_T with  ω_n² and l_0B², -1.5e-05 to 2e+07 N/m^n in eqs. 24-25, a-b"
     printed = "R_{S}/r_{0} of house.k_T with ω_{n}² and l_{0B}², −1.5·10^{−5} to 2·10^{7} N/m^{n} in eqs. 24-25, a-b"
-    assert in_print(words) == printed
-    assert [in_print(words) for words in ("6 to 12 count", "eqs. 24 and 25 count")] == ["6 to 12", "eqs. 24 and 25"]
+    assert typeset(words) == printed
+    assert [typeset(words) for words in ("6 to 12 count", "eqs. 24 and 25 count")] == ["6 to 12", "eqs. 24 and 25"]
 
 
 def test_terminal_shows_every_statement_and_the_rule(findings: Findings, capsys, monkeypatch):

@@ -18,7 +18,7 @@ import pytest
 import recorder.output.series
 from recorder.contents.metadata import Beginning
 from recorder.files.payload import Payload
-from recorder.output.disk_limits import Limits
+from recorder.output.disk_limits import DiskLimits
 from recorder.output.series import Series, part_path
 from recorder.output.sink import Needs
 from recorder.reader import Recording, join
@@ -60,7 +60,7 @@ def series(
             monotonic_s=lambda: 0.01 * next(calls),  # a flush every 25 payloads
         )
 
-    needs = Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, Limits(**limits), force, monotonic_s)
+    needs = Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, DiskLimits(**limits), force, monotonic_s)
     return Series(path, needs)
 
 
@@ -277,7 +277,7 @@ def test_free_space_is_kept_on_the_disk(tmp_path, monkeypatch):
 )
 def test_impossible_limits_are_refused(limits, must):
     with pytest.raises(InputError, match=must):
-        Limits(**limits)
+        DiskLimits(**limits)
 
 
 def test_parts_of_an_earlier_recording_are_not_mixed_with_new_ones(tmp_path, items):

@@ -16,7 +16,7 @@ import rig.base.wire
 import rig.serve.stream_check
 from recorder.contents.summary import Progress, Summary
 from recorder.files.payload import Payload
-from recorder.output.disk_limits import Limits
+from recorder.output.disk_limits import DiskLimits
 from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording
 from recorder.session import RIG_LOST, RecordingSession
@@ -538,7 +538,7 @@ def test_without_a_rig_there_is_no_file(path):
 def test_the_output_file_is_named(path):
     client, triggers = ScriptedClient(), tuple(map(Trigger.parse, ("hammer", "disk_x>1", "disk_x<0")))
     assert RecordingSession(client, path).first_files == [path]
-    parts = RecordingSession(client, path, limits=Limits(rotate_s=1.0)).first_files
+    parts = RecordingSession(client, path, limits=DiskLimits(rotate_s=1.0)).first_files
     captures = RecordingSession(client, path, capture=Capture(triggers)).first_files
     assert [file.name.removeprefix(path.stem) for file in (*parts, *captures)] == [
         *(".0000.mcap", ".hammer-001.mcap", ".disk_x-001.mcap")
@@ -552,7 +552,7 @@ def test_the_summary_of_triggers_describes_the_files(path):
     note = encode_document({"event": "note", "tick": 500_000, "time_s": 0.5, "text": "now"})
     items.insert(len(items) // 2, (EVENTS, note))
     progress: list[Progress] = []
-    session = RecordingSession(client, path, capture=capture, limits=Limits(budget_mb=50.0))
+    session = RecordingSession(client, path, capture=capture, limits=DiskLimits(budget_mb=50.0))
     summary = record(session, client, play(client, items), progress)
     (file,) = summary.files
     kept = Recording.open(file).streams
@@ -574,7 +574,7 @@ def test_without_a_trigger_nothing_is_counted_as_recorded(path):
 def test_rotation_and_triggers_together_are_refused_by_name(path):
     with pytest.raises(InputError, match=r"^rotate_mb must be omitted .* around triggers; instead received 5\.0$"):
         RecordingSession(
-            ScriptedClient(), path, capture=Capture((Trigger.parse("hammer"),)), limits=Limits(rotate_mb=5.0)
+            ScriptedClient(), path, capture=Capture((Trigger.parse("hammer"),)), limits=DiskLimits(rotate_mb=5.0)
         )
 
 

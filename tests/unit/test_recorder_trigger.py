@@ -13,7 +13,7 @@ import pytest
 from recorder.contents.metadata import Beginning
 from recorder.files.payload import Payload
 from recorder.output.captures import Captures
-from recorder.output.disk_limits import Limits
+from recorder.output.disk_limits import DiskLimits
 from recorder.output.sink import Needs
 from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording
@@ -27,7 +27,9 @@ from .recorder_stream import TICK_RATE_HZ, make_block, make_documents
 PROBES, FORCES = sensor_key("probes"), sensor_key("forces")
 
 
-def captures(path: Path, *triggers: str, force: bool = False, limits: Limits | None = None, **options: Any) -> Captures:
+def captures(
+    path: Path, *triggers: str, force: bool = False, limits: DiskLimits | None = None, **options: Any
+) -> Captures:
     about = make_documents()
 
     def open_file(name: Path, scene: dict[str, Any], beginning: Beginning) -> RecordingWriter:
@@ -42,7 +44,7 @@ def captures(path: Path, *triggers: str, force: bool = False, limits: Limits | N
         )
 
     capture = Capture(tuple(Trigger.parse(text) for text in triggers), **options)
-    limits = limits or Limits(keep_free_mb=0.0)
+    limits = limits or DiskLimits(keep_free_mb=0.0)
     return Captures(path, capture, Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, limits, force))
 
 
@@ -226,7 +228,7 @@ def test_stored_and_received_rows_are_counted_separately(tmp_path):
 
 def test_the_budget_holds_for_captures(tmp_path):
     file = captures(
-        tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=1.0, limits=Limits(budget_mb=5.0, keep_free_mb=0.0)
+        tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=1.0, limits=DiskLimits(budget_mb=5.0, keep_free_mb=0.0)
     )
     for number in range(3000):
         if not file.ended:

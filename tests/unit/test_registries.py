@@ -96,7 +96,7 @@ def test_a_format_without_a_writer_is_refused_and_not_written_as_csv(
 ) -> None:
     monkeypatch.setattr(export, "SUFFIXES", (*export.SUFFIXES, ".xyz"))
     with pytest.raises(InputError, match=r"output must be a format with a writer; .* '.xyz'"):
-        export.writer_for(tmp_path / "run.xyz", rig.Simulation("stable-run"))
+        export.make_writer(tmp_path / "run.xyz", rig.Simulation("stable-run"))
     assert not list(tmp_path.iterdir())
 
 

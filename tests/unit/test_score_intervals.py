@@ -15,7 +15,7 @@ from replays.score.card.limits import load_limits
 from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, Scorecard, judge_row
 from replays.score.quantities.noise import split_noise
 from replays.score.quantities.rounding import Converter, find_undithered, widen_intervals
-from replays.score.records.recorded import Table
+from replays.score.records.recorded import RecordedTable
 from replays.score.waveform import Waveform
 from rig.channels.table import default_table
 from tests.score_coverage import NOISES, ROWS, Estimate, compute_estimates, summarise_cell
@@ -111,7 +111,7 @@ def test_the_interval_of_stamp_jitter_follows_chi_squared() -> None:
     from scipy.stats import chi2
 
     n = 4096
-    table = Table(n, 1, lambda columns: [np.zeros((n, 1 + len(columns)))])
+    table = RecordedTable(n, 1, lambda columns: [np.zeros((n, 1 + len(columns)))])
     stamps, since_s = Stamps(table, shown=True), np.arange(n) / 20e3
     stamps.times_s = 0.25 + since_s * (1.0 + 5e-5) + 1e-6 * np.random.default_rng(5).standard_normal(n)
     stamps.add_rows(0.0, since_s, np.arange(n), n)

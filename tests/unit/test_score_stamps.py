@@ -10,7 +10,7 @@ import pytest
 
 from replays.score.card.scorecard import FAIL
 from replays.score.judgement import judge
-from replays.score.records.recorded import Table
+from replays.score.records.recorded import RecordedTable
 from rig.channels.table import default_table
 from tests.score_daqs import RATE_HZ, make_counts, write_parquet, write_session
 
@@ -54,12 +54,12 @@ STAMPS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], set[str]]] = {
 @pytest.mark.parametrize("rate_hz", [20_000.0, 20_006.0])
 def test_coarse_stamps_give_the_rate(resolution_s: float, rate_hz: float) -> None:
     stamps = np.floor(np.arange(20_000) / rate_hz / resolution_s + 1e-6) * resolution_s
-    assert Table(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(rate_hz, rel=20e-6)
+    assert RecordedTable(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(rate_hz, rel=20e-6)
 
 
 def test_lost_rows_do_not_change_the_rate_of_stamps() -> None:
     stamps = np.delete(np.arange(20_000) / RATE_HZ, [3000, 3001, 9000])
-    assert Table(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(RATE_HZ, rel=1e-9)
+    assert RecordedTable(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(RATE_HZ, rel=1e-9)
 
 
 JITTER: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
@@ -76,7 +76,7 @@ JITTER: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
 def test_jitter_does_not_change_the_rate_of_stamps(kind: str) -> None:
     for seed in range(4):
         stamps = JITTER[kind](np.arange(12_000) / RATE_HZ, np.random.default_rng(seed))
-        table = Table(len(stamps), 0, lambda _, stamps=stamps: [stamps[:, None]])
+        table = RecordedTable(len(stamps), 0, lambda _, stamps=stamps: [stamps[:, None]])
         assert table.rate_hz == pytest.approx(RATE_HZ, rel=3e-6)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from replays.score.alignment.alignment import align
-from replays.score.alignment.one_begin import Source
+from replays.score.alignment.one_begin import RowSource
 from replays.score.alignment.repeats import find_repeats
 from replays.score.alignment.row_times import Follower, Track, follow_record
 from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
@@ -169,7 +169,9 @@ def test_a_repeating_signal_uses_the_start_that_explains_all_signals() -> None:
         values = signal(begin_s + ROWS / RATE_HZ) + 1e-4 * generator.standard_normal(len(ROWS))
         wrong_s = begin_s - repeat_s
         wire = Wire(name, 1, likeness, (), False, wrong_s, (0.0, 0.7), (begin_s,), wrong_s)
-        sources.append(Source(name, table[name], wire, values, 0.0, RATE_HZ, Exact(signal, (0.0, 2.0), RATE_HZ), 0.0))
+        sources.append(
+            RowSource(name, table[name], wire, values, 0.0, RATE_HZ, Exact(signal, (0.0, 2.0), RATE_HZ), 0.0)
+        )
     found = align(sources)
     assert found is not None
     assert not found.ambiguous  # at each of the other begins the pulse is at another part of the whirl
@@ -184,12 +186,12 @@ SLOW_RATE_HZ = 3e3
 def make_slow_sources(
     signals: Sequence[Callable[[np.ndarray], np.ndarray]], kept: np.ndarray, *, begin_s: float, found_s: float,
     end_s: float, noise: float,
-) -> list[Source]:  # fmt: skip
+) -> list[RowSource]:  # fmt: skip
     """Return probes that were recorded from a begin on, and were first found at another one."""
     generator, table = np.random.default_rng(0), list(default_table().channels.values())
     wire = Wire("", 1, 1.0, (), False, found_s, (0.0, 0.7), (begin_s,), found_s)
     return [
-        Source(
+        RowSource(
             channel.name, channel, replace(wire, channel=channel.name, likeness=1.0 - 0.1 * n),
             signal(begin_s + kept / SLOW_RATE_HZ) + noise * generator.standard_normal(len(kept)),
             0.0, SLOW_RATE_HZ, Exact(signal, (0.0, end_s), SLOW_RATE_HZ), 0.0,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import LeadIns, Measured, bare, interpolate_rows, predict
-from replays.recordings.resimulation.sensitivity import Predictor, value_of, with_values
+from replays.recordings.resimulation.prediction import LeadIns, Measured, interpolate_rows, predict, simplify
+from replays.recordings.resimulation.sensitivity import Predictor, get_value, with_values
 from rig.base.errors import InputError
 from rig.channels.table import Channel, default_table
 from rig.run.offline import SentCommand, simulate
@@ -44,7 +44,7 @@ def experiment() -> Experiment:
 
 def test_channels_equal_the_recorded_ones_except_noise_and_rounding(experiment: Experiment) -> None:
     found = shown(experiment, *CHANNELS, start_s=0.01, end_s=0.05)
-    run = simulate(experiment.changed({"sensors.noise": False}).scene)
+    run = simulate(experiment.with_changes({"sensors.noise": False}).scene)
     for column, name in enumerate(CHANNELS):
         rounding = abs(run.table.channels[name].scale)
         assert np.abs(found[:, column] - run.samples[name][200:1000]).max() <= 0.51 * rounding
@@ -74,7 +74,7 @@ def test_a_late_start_is_the_same_as_from_the_start(sent: tuple[SentCommand, ...
 
 def test_experiments_share_the_run_before_their_first_difference() -> None:
     pulse = {"at_s": 0.46, "command": "hammer", "force_n": 60.0, "duration_ms": 5.0, "direction": "x"}
-    experiment = bare(Experiment(scene=load_scene("hammer", {"duration_s": 0.5, "commands": [pulse]})))
+    experiment = simplify(Experiment(scene=load_scene("hammer", {"duration_s": 0.5, "commands": [pulse]})))
     parts = make_rows(("ring_x", "hammer"), np.arange(9000, 10_000) / 20_000)
     lead_ins = LeadIns()
     for values in ({}, {"hammer.1.force_n": 90.0}, {"hammer.1.at_s": 0.2}, {"shaft.unbalance_phase": 0.1}):
@@ -160,7 +160,7 @@ def test_a_value_without_effect_has_no_derivative(experiment: Experiment) -> Non
 
 
 def test_numbers_override_rules(experiment: Experiment) -> None:
-    sag_mm = value_of(experiment, "ring.offset_y")
+    sag_mm = get_value(experiment, "ring.offset_y")
     assert sag_mm == pytest.approx(-1.5606, abs=1e-3)
     moved = with_values(experiment, {"ring.offset_y": sag_mm + 0.01})
     assert moved.scene.load_parameters().rule("ring.offset_y") is None
@@ -171,15 +171,15 @@ def test_commands_of_all_sources_are_numbered_by_time() -> None:
     scene = load_scene("hammer", {"duration_s": 0.2})
     sent = SentCommand(100_000, "hammer", {"force_n": 50.0, "duration_ms": 4.0, "direction": "y"})
     both = Experiment(scene=scene, commands=(sent,))
-    assert value_of(both, "hammer.1.at_s") == 0.02
-    assert value_of(both, "hammer.2.force_n") == 50.0
-    assert value_of(both, "hammer.2.direction") == pytest.approx(90.0)
+    assert get_value(both, "hammer.1.at_s") == 0.02
+    assert get_value(both, "hammer.2.force_n") == 50.0
+    assert get_value(both, "hammer.2.direction") == pytest.approx(90.0)
     same = with_values(both, {"hammer.2.force_n": 50.0})
     a, b = (shown(one, "ring_x", "hammer", end_s=0.12) for one in (both, same))
     assert np.array_equal(a, b)
     for key in ("hammer.3.force_n", "hammer.1.loudness", "contact.frictionn", "engine.name"):
         with pytest.raises(InputError):
-            value_of(both, key)
+            get_value(both, key)
 
 
 def test_times_of_impacts_are_interpolated_between_rows(experiment: Experiment) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.formats.clock import axis_of_stamps
+from replays.recordings.formats.clock import make_axis
 from replays.score.card.scorecard import FAIL, PASS
 from replays.score.judgement import judge
 from rig.base.errors import InputError
@@ -130,8 +130,8 @@ def test_stamps_without_a_rate_do_not_change_the_analogue_path(
 @pytest.mark.parametrize("name", NO_RATE)
 def test_stamps_without_a_rate_are_refused_in_one_line(name: str) -> None:
     with pytest.raises(InputError, match=r"ascending by 1 ns or more on average .*disk_x, "):
-        axis_of_stamps(STAMPS[name][0], line=True, what="disk_x")
-    assert axis_of_stamps(1e-9 * ROWS, line=True, what="disk_x").rate_hz == pytest.approx(1e9)
+        make_axis(STAMPS[name][0], line=True, what="disk_x")
+    assert make_axis(1e-9 * ROWS, line=True, what="disk_x").rate_hz == pytest.approx(1e9)
 
 
 Change = Callable[[Block, int], dict[str, object]]

@@ -148,7 +148,7 @@ def test_panel_of_one_short_scene_is_journalled_and_resumed(tmp_path: Path, monk
     monkeypatch.setattr(session, "TWELVE_SCENES", ["hammer-6.2", "smoothed"])
     monkeypatch.setattr(session, "find_reference", lambda *_problem, **_options: None)  # peers take long to compile
 
-    def chart() -> session.Outcome:
+    def chart() -> session.ChartOutcome:
         methods = ["split", "tsit5", "semi-implicit-euler"]
         return make_chart(tmp_path, panels=["scenes"], peers=False, end_s=0.04, methods=methods)
 

@@ -14,7 +14,7 @@ from recorder.reader import Recording, join
 from recorder.rewrite import cut
 from recorder.writer import RecordingWriter
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import Measured, Prediction, bare, measured, predict
+from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured, simplify
 from replays.recordings.validation import load_criteria, outcome, validate
 from replays.recordings.validation.bits import Bits
 from replays.recordings.validation.criteria import DEFAULT, Criteria
@@ -217,9 +217,9 @@ def test_of_some_channels_the_bits_are_compared_by_name(
     group = recording.table.groups["probes"]
     turned = group.model_copy(update={"channels": group.channels[::-1]})
     recording.table.groups["probes"] = turned
-    experiment = Experiment.of(recording)
+    experiment = Experiment.from_recording(recording)
     bits = Bits(recording, experiment.simulation().table)
-    predict(experiment, measured(recording, experiment.scene), follow=bits.follow)
+    predict(experiment, read_measured(recording, experiment.scene), follow=bits.follow)
     assert [key for key, stream in bits.finish().items() if not stream.equal] == [sensor_key("probes")]
 
 
@@ -291,7 +291,7 @@ def test_rows_of_another_clock_are_between_the_models(
     parts, nominal = heard
     part = parts["probes"]
     late = replace(part, times_s=part.times_s[:40] + 1e-3 / 3.0, index=part.index[:40], values=part.values[:40])
-    between = predict(bare(Experiment.of(hammer)), {"probes": late}).values["probes"]
+    between = predict(simplify(Experiment.from_recording(hammer)), {"probes": late}).values["probes"]
     assert between == pytest.approx(CubicSpline(part.times_s, nominal.values["probes"])(late.times_s), abs=2e-5)
 
 
@@ -299,7 +299,7 @@ def test_rows_of_another_clock_are_between_the_models(
 
 
 def explained(recording: Recording, parts: dict[str, Measured], nominal: Prediction) -> Explained:
-    experiment = bare(Experiment.of(recording))
+    experiment = simplify(Experiment.from_recording(recording))
     rules = load_criteria().attribution
     few = [one for one in rules.candidates if one.name in ("contact.friction", "house.preload", "magnet.stiffness")]
     return attribute(experiment, parts, nominal, rules.model_copy(update={"candidates": tuple(few)}), from_s=0.0)
@@ -307,9 +307,9 @@ def explained(recording: Recording, parts: dict[str, Measured], nominal: Predict
 
 @pytest.fixture(scope="module")
 def heard(hammer: Recording) -> tuple[dict[str, Measured], Prediction]:
-    experiment = Experiment.of(hammer)
-    parts = measured(hammer, experiment.scene, longest_s=1.0)
-    return parts, predict(bare(experiment), parts)
+    experiment = Experiment.from_recording(hammer)
+    parts = read_measured(hammer, experiment.scene, longest_s=1.0)
+    return parts, predict(simplify(experiment), parts)
 
 
 def with_fault(parts: dict[str, Measured], group: str, matrix: np.ndarray, shift: float = 0.0) -> dict[str, Measured]:

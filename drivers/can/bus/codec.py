@@ -118,7 +118,7 @@ class CodecError(ValueError):
     """A payload is not a message of this bus, or no controller can send a frame."""
 
 
-class Report(NamedTuple):
+class NodeReport(NamedTuple):
     """State of one node.
 
     Args:
@@ -138,7 +138,7 @@ class Report(NamedTuple):
     dropped: int
 
 
-HubMessage = np.ndarray | list[Report]
+HubMessage = np.ndarray | list[NodeReport]
 """Content of a hub's message: frames, as an array of one of the `RECORDS` layouts, or states of nodes."""
 
 
@@ -195,7 +195,7 @@ def encode(records: np.ndarray) -> bytes:
     return _HEADER.pack(_MAGIC, FRAMES, width, len(records)) + records.tobytes()
 
 
-def encode_reports(reports: Iterable[Report]) -> bytes:
+def encode_reports(reports: Iterable[NodeReport]) -> bytes:
     """Encode node reports as one message."""
     rows = [_REPORT.pack(row.node, row.state, 0, *row[2:]) for row in reports]
     return _HEADER.pack(_MAGIC, REPORTS, _REPORT.size, len(rows)) + b"".join(rows)
@@ -220,7 +220,7 @@ def decode(payload: bytes) -> HubMessage:
     if kind == FRAMES:
         return np.frombuffer(payload, RECORDS[width], offset=_HEADER.size)
     rows = _REPORT.iter_unpack(memoryview(payload)[_HEADER.size :])
-    return [Report(node, state, *counts) for node, state, _, *counts in rows]
+    return [NodeReport(node, state, *counts) for node, state, _, *counts in rows]
 
 
 def make_record(message: can.Message) -> Record:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.can.bus import codec
-from drivers.can.bus.frame import resize_records, sendable
+from drivers.can.bus.frame import are_sendable, resize_records
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.results import STATES
 from rig.base.errors import InputError, Words
@@ -67,7 +67,7 @@ class Endpoint:
     done: int = 0
     dropped: int = 0
     left_s: float | None = None
-    reported: codec.Report | None = None
+    reported: codec.NodeReport | None = None
     bus_offs: int = 0
 
 
@@ -259,7 +259,7 @@ class Endpoints:
             now_ns: Time of the bus [ns].
             due_ns: Time of the bus at which the controller receives each frame [ns], shape of `records`; None for now.
         """
-        is_sendable = sendable(records, fd=self._model.speed.fd)
+        is_sendable = are_sendable(records, fd=self._model.speed.fd)
         good = records[is_sendable]
         room = 0 if endpoint.listen_only else max(0, WINDOW - (endpoint.offered - endpoint.done))
         accepted = resize_records(good[:room])
@@ -287,11 +287,11 @@ class Endpoints:
                 endpoint.done += 1
                 endpoint.dropped += outcome != 0
 
-    def report(self, endpoint: Endpoint) -> codec.Report:
+    def report(self, endpoint: Endpoint) -> codec.NodeReport:
         """Return the state of an endpoint."""
         node = self._model.node(endpoint.node)
         state = STATES.index(node.state)
-        return codec.Report(endpoint.number, state, node.tec, node.rec, endpoint.done, endpoint.dropped)
+        return codec.NodeReport(endpoint.number, state, node.tec, node.rec, endpoint.done, endpoint.dropped)
 
 
 def _new_secret() -> str:

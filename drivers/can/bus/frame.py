@@ -102,7 +102,7 @@ def find_fault(record: Record, *, fd: bool = True) -> str | None:
     return None
 
 
-def sendable(records: np.ndarray, *, fd: bool = True) -> np.ndarray:
+def are_sendable(records: np.ndarray, *, fd: bool = True) -> np.ndarray:
     """Return for each frame whether a controller could send it (see `find_fault`), shape of `records`.
 
     Args:

@@ -358,7 +358,7 @@ class Hub(Closing):
         size = codec.MAX_RECORDS
         return [records[first : first + size] for first in range(0, len(records), size)]
 
-    def _reports(self, now: int) -> list[codec.Report]:
+    def _reports(self, now: int) -> list[codec.NodeReport]:
         """Return the reports that have changed, after removing endpoints that have left."""
         found = []
         self.endpoints.forget_gone()
@@ -380,7 +380,7 @@ class Hub(Closing):
                 self._queue_state_change(now, report, codec.CONTROLLER, _CONTROLLER_STATES[report.state])
         return found
 
-    def _queue_state_change(self, now: int, report: codec.Report, kind: int, detail: int) -> None:
+    def _queue_state_change(self, now: int, report: codec.NodeReport, kind: int, detail: int) -> None:
         """Queue an error frame about one node's controller."""
         counters = (min(report.transmit_errors, 255), min(report.receive_errors, 255))
         data = bytes((0, detail, 0, 0, 0, 0, *counters))

@@ -87,7 +87,7 @@ class NodeBus(can.BusABC):
         self._window = 0
         self.offered = 0
         self.done = 0
-        self._report = codec.Report(codec.NO_NODE, 0, 0, 0, 0, 0)
+        self._report = codec.NodeReport(codec.NO_NODE, 0, 0, 0, 0, 0)
         self._there = False
         self._filters = None
         self.dropped = 0
@@ -138,10 +138,10 @@ class NodeBus(can.BusABC):
         except InputError as error:
             raise can.CanInitializationError(f"{self._where()} refuses another node: {error}") from None
         rates = {"bitrate": answer.nominal_bit_s, "data_bitrate": answer.data_bit_s}
-        for name, asked in self._rates.items():
-            if asked is not None and rates[name] is not None and asked != rates[name]:
+        for name, requested in self._rates.items():
+            if requested is not None and rates[name] is not None and requested != rates[name]:
                 raise can.CanInitializationError(
-                    f"{name} must be that of {self._where()}, {rates[name]}; instead received {asked}"
+                    f"{name} must be that of {self._where()}, {rates[name]}; instead received {requested}"
                 )
         if self._fd_asked and not answer.fd:
             raise can.CanInitializationError(f"{self._where()} has a bus for classic CAN only; fd=True asks for CAN FD")
@@ -150,10 +150,10 @@ class NodeBus(can.BusABC):
             self._fd = answer.fd and self._fd_asked is not False
             self._window = answer.window
             self.offered = self.done = 0
-            self._report = codec.Report(self.node, 0, 0, 0, 0, 0)
+            self._report = codec.NodeReport(self.node, 0, 0, 0, 0, 0)
             self._there = True
 
-    def _lost(self) -> None:
+    def _on_hub_lost(self) -> None:
         """Record that the hub has stopped, and wake waiting senders."""
         with self._lock:
             self._there = False
@@ -195,7 +195,7 @@ class NodeBus(can.BusABC):
             if len(records):
                 self._store(records, filters)
 
-    def _take_reports(self, reports: Sequence[codec.Report]) -> None:
+    def _take_reports(self, reports: Sequence[codec.NodeReport]) -> None:
         with self._lock:
             for report in reports:
                 if report.node == self.node:
@@ -217,7 +217,7 @@ class NodeBus(can.BusABC):
             self._overflowed = True
         self._arrived.notify()
 
-    def _missed(self, count: int) -> None:
+    def _count_missed(self, count: int) -> None:
         """Count messages of the hub that never arrived."""
         with self._lock:
             self.missed += count

@@ -39,7 +39,7 @@ class Configuration:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class CommandDone:
     """Acknowledgement of a command.
 
     Attributes:
@@ -114,7 +114,7 @@ class Instrument(Closing):
         """Close the link; further calls have no effect."""
         self.link.close()
 
-    def _act(self, act: protocol.Act) -> Done:
+    def _act(self, act: protocol.Act) -> CommandDone:
         """Send a command.
 
         Raises:
@@ -122,7 +122,7 @@ class Instrument(Closing):
             LinkError: No reply came; the command may or may not take effect.
         """
         done = self.ask(act, protocol.Done)
-        return Done(id=done.id, tick=done.tick, time_s=done.time_s)
+        return CommandDone(id=done.id, tick=done.tick, time_s=done.time_s)
 
     def ask(self, request: InstrumentMessage, expected: type[M]) -> M:
         """Send a request of the protocol, and return the reply, which must be of the expected class.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.instruments.common.aio import AsyncSampler, make_async
-from drivers.instruments.common.driver import Done, Sampler
+from drivers.instruments.common.driver import CommandDone, Sampler
 from drivers.instruments.drive.protocol import CODEC, SetSpeed
 
 
@@ -12,7 +12,7 @@ class Drive(Sampler):
 
     CODEC = CODEC
 
-    def set_speed(self, hz: float) -> Done:
+    def set_speed(self, hz: float) -> CommandDone:
         """Set the speed set point of the drive.
 
         Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.instruments.common.aio import AsyncSampler, make_async
-from drivers.instruments.common.driver import Done, Sampler
+from drivers.instruments.common.driver import CommandDone, Sampler
 from drivers.instruments.hammer.protocol import CODEC, Hit
 
 
@@ -12,7 +12,7 @@ class Hammer(Sampler):
 
     CODEC = CODEC
 
-    def trigger(self, *, force_n: float = 100.0, duration_ms: float = 5.0, direction: str | float = "x") -> Done:
+    def trigger(self, *, force_n: float = 100.0, duration_ms: float = 5.0, direction: str | float = "x") -> CommandDone:
         """Trigger an impact.
 
         Args:

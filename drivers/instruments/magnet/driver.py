@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.instruments.common.aio import AsyncInstrument, make_async
-from drivers.instruments.common.driver import Done, Instrument
+from drivers.instruments.common.driver import CommandDone, Instrument
 from drivers.instruments.magnet.protocol import CODEC, Release
 
 
@@ -12,7 +12,7 @@ class Magnet(Instrument):
 
     CODEC = CODEC
 
-    def release(self) -> Done:
+    def release(self) -> CommandDone:
         """Release the shaft.
 
         Raises:

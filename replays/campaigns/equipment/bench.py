@@ -64,7 +64,7 @@ class Target:
     replay: Path | None = None
 
     @property
-    def own(self) -> bool:
+    def owns_rig(self) -> bool:
         """True if each test starts its own rig."""
         return self.url is None and self.replay is None
 
@@ -150,7 +150,7 @@ class Bench(Closing):
         try:
             self._console = self.connect(name="campaign", channels=())
             self.pace: str = self._console.pace
-            if not target.own:
+            if not target.owns_rig:
                 self._check_target()
         except BaseException:
             self.close()
@@ -183,7 +183,7 @@ class Bench(Closing):
         if self.target.replay is not None:
             self._console.resume()
             return 0.0
-        if self.target.own and self.pace == "lockstep":
+        if self.target.owns_rig and self.pace == "lockstep":
             return 0.0
         status = self.status()
         self._late_before = status["overruns"]
@@ -191,7 +191,7 @@ class Bench(Closing):
 
     def late_blocks(self) -> int:
         """Return the number of blocks that missed their deadline in real time since the test began."""
-        if self.target.own and self.pace == "real-time":
+        if self.target.owns_rig and self.pace == "real-time":
             with contextlib.suppress(RefusedError, ConnectionError):  # the rig has ended; the last count remains
                 self._late = self.status()["overruns"] - self._late_before
         return self._late
@@ -304,15 +304,15 @@ class Bench(Closing):
         """Return the median and maximum round-trip time of a request [ms], the lower limit of any command latency."""
         round_trips_ms = []
         for _ in range(_ROUND_TRIPS):
-            begun = time.perf_counter()
+            start_s = time.perf_counter()
             self._console.status()
-            round_trips_ms.append(1e3 * (time.perf_counter() - begun))
+            round_trips_ms.append(1e3 * (time.perf_counter() - start_s))
         return statistics.median(round_trips_ms), max(round_trips_ms)
 
     @property
     def resolution(self) -> str:
         """Resolution of a device's reaction time in words; the same for every run in lockstep."""
-        block = f"{self.settings.block_ms:g} ms blocks" if self.target.own else "blocks of the existing rig"
+        block = f"{self.settings.block_ms:g} ms blocks" if self.target.owns_rig else "blocks of the existing rig"
         return f"{block}, in lockstep" if self.pace == "lockstep" else f"{block}, and the measured round trip"
 
     def close(self) -> None:

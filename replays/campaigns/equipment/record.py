@@ -33,7 +33,7 @@ class Record:
 
         self.path, self._bench = path, bench
         self._client = connect_url(bench.url, wait_s=_BEGIN_S)
-        own = bench.target.own
+        own = bench.target.owns_rig
         # Plots come from the evidence, so the whole recording needs no data for views.
         self._session: RecordingSession = RecordingSession(
             self._client, path, name="campaign", view_rate_hz=0.0, history=own, force=True
@@ -97,11 +97,11 @@ class Record:
             return
         time_s = self._bench.status()["time_s"]
 
-        def all_here() -> bool:
+        def has_all_samples() -> bool:
             return self._progress is not None and self._progress.time_s >= time_s - _MAX_INTERVAL_S
 
         if time_s > 0.0:
-            wait_until(lambda: all_here() or not self._thread.is_alive(), 5.0)
+            wait_until(lambda: has_all_samples() or not self._thread.is_alive(), 5.0)
 
 
 _MAX_INTERVAL_S = 2e-3

@@ -19,7 +19,7 @@ from replays.campaigns.equipment.bench import BenchSettings, Pace
 from replays.campaigns.equipment.device import PLACES, check_program
 from replays.campaigns.files.case_results import Time, Units
 from replays.campaigns.files.expectation import KINDS, Expect
-from replays.campaigns.files.line_numbers import line_of, lines_of
+from replays.campaigns.files.line_numbers import find_line, number_lines
 from replays.campaigns.measurement import split_quantity
 from rig.base import units
 from rig.base.checks import Written, build_read_error, check, open_file, parse_toml
@@ -140,7 +140,7 @@ class Campaign:
     cases: tuple[Case, ...]
 
 
-def shipped() -> dict[str, Path]:
+def find_shipped() -> dict[str, Path]:
     """Return the files of the shipped campaigns, in TOML or for pytest, by name."""
     found = {file.name.removesuffix(SUFFIX): file for file in FOLDER.glob(f"*{SUFFIX}")}
     found |= {file.stem.removeprefix("test_").replace("_", "-"): file for file in FOLDER.glob("test_*.py")}
@@ -161,7 +161,7 @@ def campaign_path(name_or_path: str) -> Path:
     Raises:
         UnknownNameError: If the argument looks like a name but is neither a shipped campaign nor a file.
     """
-    known, path = shipped(), Path(name_or_path)
+    known, path = find_shipped(), Path(name_or_path)
     if name_or_path not in known and re.fullmatch(r"[\w-]+", name_or_path) and not path.exists():
         raise UnknownNameError("FILE", "a file or a shipped campaign", name_or_path, known)
     return known.get(name_or_path, path)
@@ -183,28 +183,28 @@ def load_campaign(path: Path) -> Campaign:
     try:
         document = parse_toml(text, field=str(path))
     except tomllib.TOMLDecodeError as error:
-        says, _, place = str(error).partition(" (at ")
+        problem, _, place = str(error).partition(" (at ")
         line = re.search(r"line (\d+)", place)
         where = f"{path}:{line[1] if line else text.count(chr(10)) + 1}"
-        raise InputError(f"{where}: the text", "TOML", Words(says)) from None
-    with _located(path, text):
+        raise InputError(f"{where}: the text", "TOML", Words(problem)) from None
+    with _add_location(path, text):
         file = check(_File, document, field="")
         cases = tuple(_cases(path, file))
-        seen: set[str] = set()
+        ids: set[str] = set()
         for case in cases:
-            if case.id in seen:
+            if case.id in ids:
                 raise InputError("matrix", "cases with different names (give the faults an id)", case.id)
-            seen.add(case.id)
+            ids.add(case.id)
     return Campaign(file.title, file.about, cases)
 
 
 @contextmanager
-def _located(path: Path, text: str) -> Iterator[None]:
+def _add_location(path: Path, text: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        lines = lines_of(text)
-        line = line_of(error.field, lines) or 1
+        lines = number_lines(text)
+        line = find_line(error.field, lines) or 1
         field = re.sub(r"\.\d+(?=\.|$)", "", error.field)
         must, received = error.must, error.received
         raise InputError(f"{path}:{line}: {field}", must, received) from None
@@ -235,16 +235,16 @@ def _axes(file: _File) -> Iterator[tuple[str, list[tuple[str, Any]]]]:
         yield "scene", [(Path(each).stem, each) for each in matrix.scene]
     for key, values in matrix.set.items():
         short = key.rpartition(".")[2]
-        yield f"set {key}", [(f"{short}={_short(value)}", value) for value in values]
+        yield f"set {key}", [(f"{short}={_shorten(value)}", value) for value in values]
     if matrix.fault:
         yield "fault", [(_fault_name(each, n), (n, each)) for n, each in enumerate(matrix.fault)]
     for key, values in matrix.limits.items():
-        yield f"limits {key}", [(f"{key}={_short(value)}", value) for value in values]
+        yield f"limits {key}", [(f"{key}={_shorten(value)}", value) for value in values]
     for key, values in matrix.device.items():
-        yield f"device {key}", [(f"{key}={_short(value)}", value) for value in values]
+        yield f"device {key}", [(f"{key}={_shorten(value)}", value) for value in values]
 
 
-def _short(value: Any) -> str:
+def _shorten(value: Any) -> str:
     return re.sub(r"[^\w.+-]+", "", f"{value:g}" if isinstance(value, float) else str(value))[:40] or "empty"
 
 
@@ -432,7 +432,7 @@ def _expect(
 def _when(expect: Expect) -> Iterator[tuple[str, list[str]]]:
     """Yield the axes that restrict an expectation, each with the labels of its values."""
     for axis, given in expect.when.items():
-        labels = [_short(each) for each in (given if isinstance(given, list) else [given])]
+        labels = [_shorten(each) for each in (given if isinstance(given, list) else [given])]
         short = "" if axis in ("scene", "fault") else f"{axis.rpartition('.')[2]}="
         yield axis, [label if label.startswith(short) else f"{short}{label}" for label in labels]
 

@@ -92,17 +92,17 @@ class CaseRecording:
         key = file, limits, path, channels
         if key not in self._cards:
             sent = [part.path for part in self.recording.parts]
-            parse_limit = load_limits(limits)
-            self._cards[key] = judge(self.folder / file, sent, limits=parse_limit, path=path, channels=channels)
+            loaded = load_limits(limits)
+            self._cards[key] = judge(self.folder / file, sent, limits=loaded, path=path, channels=channels)
         return self._cards[key]
 
 
 def parse_limit(text: str, unit: str, *, where: str, of: str) -> Must:
     """Parse a limit and check its unit; the limit keeps the unit of the text."""
     field = f"{where}.must"
-    parse_limit = Must.parse(text, field=field)
-    parse_limit.within(unit, field=field, of=of)
-    return parse_limit
+    limit = Must.parse(text, field=field)
+    limit.convert_to(unit, field=field, of=of)
+    return limit
 
 
 def convert_unit(value: float, unit: str, must: Must) -> float:

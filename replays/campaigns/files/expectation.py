@@ -29,7 +29,7 @@ else:
     """Events of a rig or a replay."""
 
 
-class _Signal(Written):
+class _SignalFields(Written):
     signal: str | list[str] = ""
     truth: str = ""
 
@@ -58,11 +58,11 @@ class _Signal(Written):
             raise InputError(f"{where}.signal", "two of one unit", found)
         return known[self.names[0]]
 
-    def values(self, seen: CaseRecording) -> tuple[np.ndarray, np.ndarray]:
+    def values(self, recording: CaseRecording) -> tuple[np.ndarray, np.ndarray]:
         """Return times from the start of the case [s] and values, for an orbit its radius, each of shape (n,)."""
-        rows = seen.rows(self.truth, self.names)
+        rows = recording.rows(self.truth, self.names)
         columns = [rows[name] for name in self.names]
-        return rows.times_s - seen.origin_s, columns[0] if len(columns) == 1 else np.hypot(*columns)
+        return rows.times_s - recording.origin_s, columns[0] if len(columns) == 1 else np.hypot(*columns)
 
 
 class EventOf(Written):
@@ -76,11 +76,11 @@ class EventOf(Written):
         about = [f"{name}={value}" for name, value in self.where.items()] + [self.text]
         return " ".join([self.event, *filter(None, about)])
 
-    def times_s(self, seen: CaseRecording) -> list[float]:
+    def times_s(self, recording: CaseRecording) -> list[float]:
         """Return the times of the event, from the start of the case [s]."""
-        return [time_s for time_s, event in seen.events if self._is(event)]
+        return [time_s for time_s, event in recording.events if self._matches(event)]
 
-    def _is(self, event: Mapping[str, Any]) -> bool:
+    def _matches(self, event: Mapping[str, Any]) -> bool:
         if event.get("event") != self.event or self.text not in str(event.get("text", "")):
             return False
         for name, wanted in self.where.items():
@@ -92,7 +92,7 @@ class EventOf(Written):
         return True
 
 
-class Since(_Signal):
+class Since(_SignalFields):
     """Origin of a time: a time of the case, an event, or the first sample beyond a level."""
 
     at_s: Time | None = None
@@ -114,14 +114,14 @@ class Since(_Signal):
             unit = self.unit(units, where=where)
             quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))
 
-    def time_s(self, seen: CaseRecording, units: Units, *, from_s: float) -> float:
+    def time_s(self, recording: CaseRecording, units: Units, *, from_s: float) -> float:
         """Return the time of the origin, from the start of the case [s]; NaN if it does not occur."""
         if self.at_s is not None:
             return self.at_s
         if self.event:
             event = EventOf(event=self.event, where=self.where, text=self.text)
-            return next((each for each in event.times_s(seen) if each >= from_s), math.nan)
-        times_s, values = self.values(seen)
+            return next((each for each in event.times_s(recording) if each >= from_s), math.nan)
+        times_s, values = self.values(recording)
         level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="")
         rows = np.flatnonzero((np.abs(values) > level) & (times_s >= from_s - 1e-9))
         return float(times_s[rows[0]]) if len(rows) else math.nan
@@ -132,7 +132,7 @@ class _Within(Expected):
     to_s: Time | None = None
 
 
-class ExpectSignal(_Signal, _Within):
+class ExpectSignal(_SignalFields, _Within):
     """A value computed from a signal between two times."""
 
     take: Take = "peak"
@@ -174,18 +174,18 @@ class ExpectSignal(_Signal, _Within):
         at = f" at {self.at_s:g} s" if self.at_s is not None else ""
         return self.name or f"{self.take}{level} of {_name(self.names)}{at}"
 
-    def measure(self, seen: CaseRecording, units: Units) -> Iterator[Measurement]:
+    def measure(self, recording: CaseRecording, units: Units) -> Iterator[Measurement]:
         """Yield the measurement from the recording."""
         must = self.check(units, where="expect")
-        value, at_s, note = self._value(seen, units)
-        row_s = 1.0 / seen.rows(self.truth, self.names).rate_hz
+        value, at_s, note = self._value(recording, units)
+        row_s = 1.0 / recording.rows(self.truth, self.names).rate_hz
         unit = "s" if self.beyond else "Hz" if self.take == "whirl frequency" else self.unit(units, where="expect")
         exact = f"1 row, {1e6 * row_s:g} us" if self.beyond else ""
         channels = () if self.truth else self.names
         yield Measurement(self.label, convert_unit(value, unit, must), must, self.source, exact, note, at_s, channels)
 
-    def _value(self, seen: CaseRecording, units: Units) -> tuple[float, float | None, str]:
-        times_s, values = self.values(seen)
+    def _value(self, recording: CaseRecording, units: Units) -> tuple[float, float | None, str]:
+        times_s, values = self.values(recording)
         if self.at_s is not None:
             row = int(np.argmin(np.abs(times_s - self.at_s)))
             return float(values[row]), float(times_s[row]), ""
@@ -196,20 +196,20 @@ class ExpectSignal(_Signal, _Within):
         if self.take == "whirl frequency":
             from rig.channels.orbit import whirl_frequency
 
-            x, y = (seen.rows(self.truth, self.names)[name][kept] for name in self.names)
+            x, y = (recording.rows(self.truth, self.names)[name][kept] for name in self.names)
             return whirl_frequency(x, y, times_s), float(times_s[0]), ""
         if self.beyond:
             level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="")
             rows = np.flatnonzero(np.abs(part) > level)
             if self.take == "time beyond":
-                rate = seen.rows(self.truth, self.names).rate_hz
+                rate = recording.rows(self.truth, self.names).rate_hz
                 return len(rows) / rate, float(times_s[rows[0]]) if len(rows) else None, ""
             if not len(rows):
                 return math.nan, None, f"it never exceeds {self.beyond}"
             at_s = float(times_s[rows[0] if self.take == "first beyond" else rows[-1]])
             if self.since is None:
                 return at_s, at_s, ""
-            since_s = self.since.time_s(seen, units, from_s=self.from_s)
+            since_s = self.since.time_s(recording, units, from_s=self.from_s)
             note = "" if math.isfinite(since_s) else "the origin of the time never occurred"
             return at_s - since_s, at_s, note
         row = {"max": part.argmax, "min": part.argmin}.get(self.take, np.abs(part).argmax)()
@@ -266,24 +266,24 @@ class ExpectEvent(_Within):
         what = "time" if self.must and self.take == "time" else "number"
         return self.name or f"{what} of {self.of}"
 
-    def measure(self, seen: CaseRecording, units: Units) -> Iterator[Measurement]:
+    def measure(self, recording: CaseRecording, units: Units) -> Iterator[Measurement]:
         """Yield the measurement from the recording."""
         must = self.check(units, where="expect")
         to_s = math.inf if self.to_s is None else self.to_s
-        times_s = [each for each in self.of.times_s(seen) if self.from_s <= each < to_s]
+        times_s = [each for each in self.of.times_s(recording) if self.from_s <= each < to_s]
         if not self.must or self.take == "count":
             at_s = times_s[0] if times_s else None
             yield Measurement(self.label, float(len(times_s)), must, self.source, at_s=at_s)
             return
         exact = "1 tick, 1 us"
-        since_s = 0.0 if self.since is None else self.since.time_s(seen, units, from_s=self.from_s)
+        since_s = 0.0 if self.since is None else self.since.time_s(recording, units, from_s=self.from_s)
         # The origin causes the event, so an event before the origin is a different one.
         at_s = next((each for each in times_s if not each < since_s), math.nan)
         note = "" if math.isfinite(at_s) else f"no {self.of} occurred"
         note = "the origin of the time never occurred" if math.isnan(since_s) else note
         value = math.nan
         if math.isfinite(at_s - since_s):
-            value = (seen.tick(at_s) - seen.tick(since_s)) / seen.tick_rate_hz
+            value = (recording.tick(at_s) - recording.tick(since_s)) / recording.tick_rate_hz
         about = at_s if math.isfinite(at_s) else since_s
         channels = () if self.since is None or self.since.truth or not self.since.signal else self.since.names
         at_s = about if math.isfinite(about) else None
@@ -304,12 +304,12 @@ class ExpectOrder(_Within):
         """Name of the measurement."""
         return self.name or f"events in order: {', then '.join(map(str, self.order))}"
 
-    def measure(self, seen: CaseRecording, units: Units) -> Iterator[Measurement]:
+    def measure(self, recording: CaseRecording, units: Units) -> Iterator[Measurement]:
         """Yield the number of events that occurred in order."""
         at_s, count, note = self.from_s, 0, ""
         to_s = math.inf if self.to_s is None else self.to_s
         for each in self.order:
-            later = [time_s for time_s in each.times_s(seen) if at_s <= time_s < to_s]
+            later = [time_s for time_s in each.times_s(recording) if at_s <= time_s < to_s]
             if not later:
                 note = f"no {each} occurred after {at_s:g} s"
                 break

@@ -12,14 +12,14 @@ _TOKEN = re.compile(
 _Token = tuple[str, int]
 
 
-def lines_of(text: str) -> dict[str, int]:
+def number_lines(text: str) -> dict[str, int]:
     r"""Return the line, counted from 1, of each key and list element by its dotted path.
 
     Args:
         text: A valid TOML text.
 
     Example:
-        >>> lines_of('a = 1\n[[b]]\nc = [\n  2,\n  { d = 3 },\n]')
+        >>> number_lines('a = 1\n[[b]]\nc = [\n  2,\n  { d = 3 },\n]')
         {'a': 1, 'b': 2, 'b.0': 2, 'b.0.c': 3, 'b.0.c.0': 4, 'b.0.c.1': 5, 'b.0.c.1.d': 5}
     """
     found: dict[str, int] = {}
@@ -32,7 +32,7 @@ def lines_of(text: str) -> dict[str, int]:
             continue
         if word == "[":
             several = (tokens.peek() or ("", 0))[0] == "["
-            name = _joined(_real(counts, tokens.key(("]",))))
+            name = _join_path(_resolve_indices(counts, tokens.key(("]",))))
             if several:
                 tokens.next()
                 number = counts[name] = counts.get(name, -1) + 1
@@ -41,13 +41,13 @@ def lines_of(text: str) -> dict[str, int]:
             found.setdefault(name, line)
             table = name
             continue
-        path = _joined([table, *tokens.key(("=",), word)])
+        path = _join_path([table, *tokens.key(("=",), word)])
         found.setdefault(path, line)
         _value(tokens, path, found)
     return found
 
 
-def line_of(field: str, lines: Mapping[str, int]) -> int | None:
+def find_line(field: str, lines: Mapping[str, int]) -> int | None:
     """Return the line of a field or of the innermost enclosing table; None if there is none."""
     while field not in lines and "." in field:
         field = field.rpartition(".")[0]
@@ -89,16 +89,16 @@ def _parts(word: str) -> list[str]:
     return [part for part in word.split(".") if part]
 
 
-def _joined(parts: list[str]) -> str:
+def _join_path(parts: list[str]) -> str:
     return ".".join(part for part in parts if part)
 
 
-def _real(counts: Mapping[str, int], parts: list[str]) -> list[str]:
+def _resolve_indices(counts: Mapping[str, int], parts: list[str]) -> list[str]:
     """Return the path of a heading, with the index of the latest table of each enclosing list."""
     found: list[str] = []
     for number, part in enumerate(parts):
         found.append(part)
-        name = _joined(found)
+        name = _join_path(found)
         if name in counts and number < len(parts) - 1:
             found.append(str(counts[name]))
     return found
@@ -117,7 +117,7 @@ def _value(tokens: _Tokens, path: str, found: dict[str, int]) -> None:
             if word in "]}":
                 return
             continue
-        inner = f"{path}.{number}" if listed else _joined([path, *tokens.key(("=",))])
+        inner = f"{path}.{number}" if listed else _join_path([path, *tokens.key(("=",))])
         number += 1
         found.setdefault(inner, line)
         _value(tokens, inner, found)

@@ -37,7 +37,7 @@ def run_case(case: Case, trial: Trial) -> None:
     """
     settings, live, steps = case.bench, [step for step in case.steps if step.command is None], case.steps
     timed = tuple(step.command for step in steps if step.command is not None)
-    if trial.target.own and settings.pace == "real-time":
+    if trial.target.owns_rig and settings.pace == "real-time":
         from rig.run.scenes import load_scene
 
         own = load_scene(settings.scene or "", dict(settings.set)).commands
@@ -62,7 +62,7 @@ def run_case(case: Case, trial: Trial) -> None:
             bench.advance_to(trial.origin_s + step.at_s)
             _send(machine, step)
         bench.advance_to(trial.origin_s + case.duration_s)
-        if trial.target.own:
+        if trial.target.owns_rig:
             bench.late_blocks()  # while the rig still responds
             _stop(machine)
             record.wait()
@@ -108,7 +108,7 @@ def _stop(machine: Rig) -> None:
 
 def end_device(device: Device, trial: Trial) -> None:
     """Wait for a device to end after the run, and judge its exit status."""
-    wait_until(lambda: device.program.status is not None or not trial.target.own, _LAST_S)
+    wait_until(lambda: device.program.status is not None or not trial.target.owns_rig, _LAST_S)
     status = device.program.status
     device.program.end()
     note = f"its last line: {device.program.last_line}" if status else ""

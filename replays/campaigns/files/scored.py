@@ -84,7 +84,7 @@ class ExpectScore(Expected):
         except InputError as error:
             yield Measurement(what, math.nan, must, self.source, note=str(error))
             return
-        rows = list(self._about(card, seen))
+        rows = list(self._select_rows(card, seen))
         if self.must:
             yield from self._values(rows, must)
             return
@@ -109,9 +109,9 @@ class ExpectScore(Expected):
             open_reason="" if failing else "; ".join(reasons[:4]),
         )  # fmt: skip
 
-    def _about(self, card: Scorecard, seen: CaseRecording) -> Iterator[ScoreRow]:
+    def _select_rows(self, card: Scorecard, seen: CaseRecording) -> Iterator[ScoreRow]:
         """Yield the rows of the quantity that concern the channels or their groups."""
-        groups = _sent(seen)
+        groups = _sent_channels(seen)
         wanted = {name for each in self._channels for name in (each, *groups.get(each, ()))}
         wires = {row.channel: str(row.value) for row in card.rows if row.quantity == "mapping"}
         for row in card.rows:
@@ -124,7 +124,7 @@ class ExpectScore(Expected):
         """Yield channel (if known), text and outcome of sent data that are not shown to be in the record."""
         from replays.score.card.scorecard import INCONCLUSIVE, PASS
 
-        groups = _sent(seen)
+        groups = _sent_channels(seen)
         wires = {row.value: row for row in card.rows if row.quantity == "mapping"}
         found = {row.channel for row in card.rows if row.quantity == "recorded" and row.verdict == PASS}
         for name in [name for each in self._channels or groups for name in groups.get(each, [each])]:
@@ -163,7 +163,7 @@ class ExpectScore(Expected):
             yield Measurement(what, math.nan, must, self.source, open_reason="the scorecard has no such quantity")
 
 
-def _sent(seen: CaseRecording) -> dict[str, tuple[str, ...]]:
+def _sent_channels(seen: CaseRecording) -> dict[str, tuple[str, ...]]:
     """Return the channels that were sent, by group."""
     groups = seen.recording.table.groups
     return {name: tuple(group.names) for name, group in groups.items() if sensor_key(name) in seen.recording.streams}

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, legend_below, new_figure, save
+from replays.report.canvas import BLUE, ORANGE, RED, add_legend, axis_label, draw_signals, house_style, new_figure, save
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
@@ -49,6 +49,6 @@ def draw(
                 limits = each.must.limit if isinstance(each.must.limit, tuple) else (each.must.limit,)
                 for limit in limits:
                     axes.axhline(limit, color=RED, lw=0.9, ls="--", label="limit")
-        axes.set(xlabel="test time [s]", ylabel=label_of(name, known[name].unit))
-    legend_below(figure)
+        axes.set(xlabel="test time [s]", ylabel=axis_label(name, known[name].unit))
+    add_legend(figure)
     save(figure, path)

@@ -48,7 +48,7 @@ class Results:
     """
 
     def __init__(self, folder: Path, against: Path | None, config: pytest.Config) -> None:
-        self._lock = _locked(folder)
+        self._lock = _lock_folder(folder)
         self._folder, self._config = folder, config
         self._earlier = None if against is None else load_results(against)
         if (folder / "results.json").is_file():  # evidence of the results that are about to be overwritten
@@ -80,11 +80,11 @@ class Results:
         case["duration_s"] += report.duration
         case |= getattr(report, "rig", {})
         if report.failed:
-            outcome = outcome_of(report)
+            outcome = find_outcome(report)
             case["outcome"] = outcome if case["outcome"] in ("interrupted", "inconclusive") else "error"
-            case["reason"] = reason_of(report) if case["reason"] == _UNFINISHED else case["reason"]
+            case["reason"] = find_reason(report) if case["reason"] == _UNFINISHED else case["reason"]
         elif report.skipped:
-            case |= {"outcome": "skipped", "reason": reason_of(report)}
+            case |= {"outcome": "skipped", "reason": find_reason(report)}
         elif report.when == "teardown" and case["outcome"] == "interrupted":
             case |= {"outcome": "passed", "reason": ""}
 
@@ -142,7 +142,7 @@ class Results:
         return shlex.join(["rig", "campaign", f"{file}{colons}{rest}", *options])
 
 
-def _locked(folder: Path) -> int:
+def _lock_folder(folder: Path) -> int:
     """Create a folder if necessary and lock it; return the handle that holds the lock."""
     import fcntl
 
@@ -159,14 +159,14 @@ def _locked(folder: Path) -> int:
     return handle
 
 
-def outcome_of(report: Any) -> str:
+def find_outcome(report: Any) -> str:
     """Return the outcome of a failed test phase: failed, error or inconclusive."""
     if getattr(report, "rig_inconclusive", False):
         return "inconclusive"
     return "failed" if report.when == "call" else "error"
 
 
-def reason_of(report: Any) -> str:
+def find_reason(report: Any) -> str:
     """Return why a test phase failed or was skipped, on one line."""
     longrepr = report.longrepr
     if isinstance(longrepr, tuple):  # a skip: file, line, reason
@@ -214,7 +214,7 @@ def write_junit(document: dict[str, Any], path: Path) -> None:
         file, _, name = case["id"].partition("::")
         wall = document["wall"]["cases"].get(case["id"], {})
         lines = [_measurement_line(each) for each in case["measurements"]] + [f"repeat: {case['repeat']}"]
-        one = junit.Case(
+        one = junit.JunitCase(
             file.replace("/", "."), name or file, _JUNIT[case["outcome"]], case["reason"], "\n".join(lines),
             wall.get("duration_s", 0.0),
         )  # fmt: skip

@@ -32,7 +32,7 @@ FILTER = (
 
 
 @dataclass(frozen=True)
-class Axis:
+class TimeAxis:
     """Time axis of a signal.
 
     Attributes:
@@ -70,13 +70,13 @@ class Axis:
         """Return the time of each sample [s], shape (n,)."""
         return self.first_s + np.arange(self.rows) / self.rate_hz if self.times_s is None else self.times_s
 
-    def shifted(self, offset_s: float, stretch: float = 1.0) -> Axis:
+    def shift(self, offset_s: float, stretch: float = 1.0) -> TimeAxis:
         """Return the axis on another clock, on which t becomes offset_s + stretch * t."""
         times_s = None if self.times_s is None else offset_s + stretch * self.times_s
         return replace(self, first_s=offset_s + stretch * self.first_s, rate_hz=self.rate_hz / stretch, times_s=times_s)
 
 
-def axis_of_stamps(times_s: np.ndarray, *, line: bool, what: str) -> Axis:
+def make_axis(times_s: np.ndarray, *, line: bool, what: str) -> TimeAxis:
     """Return the time axis of time stamps.
 
     Args:
@@ -111,9 +111,9 @@ def axis_of_stamps(times_s: np.ndarray, *, line: bool, what: str) -> Axis:
             if (spread := _jitter(kept))[1] < EVENNESS_TOLERANCE * kept.slope:
                 rows = int(numbers[-1]) + 1
                 note = f"straight line through the time stamps, {rows - n} samples missing"
-                return Axis(kept.at_zero, 1.0 / kept.slope, rows, None, spread, note, numbers)
-        return Axis(float(times_s[0]), 1.0 / step, n, times_s, jitter, "time stamps as they are")
-    return Axis(whole.at_zero, 1.0 / step, n, None, jitter, "straight line through the time stamps")
+                return TimeAxis(kept.at_zero, 1.0 / kept.slope, rows, None, spread, note, numbers)
+        return TimeAxis(float(times_s[0]), 1.0 / step, n, times_s, jitter, "time stamps as they are")
+    return TimeAxis(whole.at_zero, 1.0 / step, n, None, jitter, "straight line through the time stamps")
 
 
 def _jitter(line: Line) -> tuple[float, float]:
@@ -121,24 +121,24 @@ def _jitter(line: Line) -> tuple[float, float]:
     return float(np.sqrt(np.mean(line.residual**2))), float(np.abs(line.residual).max())
 
 
-def interpolate_linear(values: np.ndarray, axis: Axis, instants_s: np.ndarray) -> np.ndarray:
+def interpolate_linear(values: np.ndarray, axis: TimeAxis, instants_s: np.ndarray) -> np.ndarray:
     """Return values interpolated linearly; beyond the ends, the end values."""
     return np.interp(instants_s, axis.instants(), values)
 
 
-def linear_gain(axis: Axis, instants_s: np.ndarray) -> float:
+def linear_gain(axis: TimeAxis, instants_s: np.ndarray) -> float:
     """Return the rms gain of linear interpolation for white noise [1]."""
     place = np.interp(instants_s, axis.instants(), np.arange(axis.rows, dtype=float))
     part = place - np.floor(place)
     return float(np.sqrt(np.mean(part**2 + (1.0 - part) ** 2)))
 
 
-def polyphase_gain(axis: Axis, rate_hz: float) -> float:
+def polyphase_gain(axis: TimeAxis, rate_hz: float) -> float:
     """Return the rms gain of `resample_polyphase` for white noise, given by its bandwidth [1]."""
     return math.sqrt(_CUTOFF * min(1.0, rate_hz / axis.rate_hz))
 
 
-def resample_polyphase(values: np.ndarray, axis: Axis, first_s: float, rate_hz: float, rows: int) -> np.ndarray:
+def resample_polyphase(values: np.ndarray, axis: TimeAxis, first_s: float, rate_hz: float, rows: int) -> np.ndarray:
     """Resample an even signal to another rate and start with a band-limited polyphase filter.
 
     The ratio of the rates is arbitrary, so a clock error of some ppm is corrected without drift.
@@ -178,7 +178,7 @@ def resample_polyphase(values: np.ndarray, axis: Axis, first_s: float, rate_hz: 
 
 
 def find_crossings(
-    values: np.ndarray, axis: Axis, *, threshold: float | None, hysteresis: float | None, falling: bool = False
+    values: np.ndarray, axis: TimeAxis, *, threshold: float | None, hysteresis: float | None, falling: bool = False
 ) -> tuple[np.ndarray, float]:
     """Return the instants at which a signal crosses a level, interpolated linearly between samples.
 
@@ -230,7 +230,11 @@ class Shift:
 
 
 def shift_by_edges(
-    reference: tuple[np.ndarray, Axis], shifted: tuple[np.ndarray, Axis], *, threshold: float | None, within_s: float
+    reference: tuple[np.ndarray, TimeAxis],
+    shifted: tuple[np.ndarray, TimeAxis],
+    *,
+    threshold: float | None,
+    within_s: float,
 ) -> Shift:
     """Return the shift that aligns the rising edges of a common trigger.
 
@@ -258,7 +262,7 @@ def shift_by_edges(
 
 
 def shift_by_correlation(
-    reference: tuple[np.ndarray, Axis], shifted: tuple[np.ndarray, Axis], *, within_s: float
+    reference: tuple[np.ndarray, TimeAxis], shifted: tuple[np.ndarray, TimeAxis], *, within_s: float
 ) -> Shift:
     """Return the shift of maximum cross-correlation, refined between samples by a parabola.
 
@@ -271,7 +275,7 @@ def shift_by_correlation(
     rate = max(ax.rate_hz, ay.rate_hz)
     first = min(ax.first_s, ay.first_s)
 
-    def even(values: np.ndarray, axis: Axis) -> tuple[np.ndarray, float]:
+    def even(values: np.ndarray, axis: TimeAxis) -> tuple[np.ndarray, float]:
         start = first + math.ceil((axis.first_s - first) * rate - 1e-9) / rate
         instants = start + np.arange(math.floor((axis.last_s - start) * rate + 1e-9) + 1) / rate
         even_values = interpolate_linear(np.nan_to_num(values, nan=float(np.nanmean(values))), axis, instants)

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from replays.estimate.runs import true_runs
+from replays.estimate.runs import find_true_runs
 from replays.recordings.formats import clock
 from replays.recordings.formats.events import events
-from replays.recordings.formats.events.motion import Motion
+from replays.recordings.formats.events.motion import ChannelMotion
 from replays.recordings.formats.events.pulses import HammerPulse, find_pulses
 from replays.recordings.formats.group import ImportedChannel, PlacedGroup, nominal_hz, place_groups, quantise, rotate
 from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, convert_to_engineering
@@ -105,8 +105,8 @@ def convert(
     say("aligning")
     log.align()
     for entry in signals:
-        axis = log.on_common_clock(entry.axis, entry.source, entry.entry)
-        entry.axis = axis.shifted(-entry.mapping.delay_us * 1e-6)
+        axis = log.align_clock(entry.axis, entry.source, entry.entry)
+        entry.axis = axis.shift(-entry.mapping.delay_us * 1e-6)
     check_rows(signals)
     for entry in signals:
         _check_corner(entry, mapping, remarks)
@@ -136,7 +136,7 @@ def convert(
     experiment = None
     if mapping.experiment is not None:
         motions = [
-            Motion(channel, entry.values, clock.Axis(first_s[name], group.rate_hz, group.rows))
+            ChannelMotion(channel, entry.values, clock.TimeAxis(first_s[name], group.rate_hz, group.rows))
             for name, group in groups.items()
             for channel, entry in group.channels.items()
         ]
@@ -276,7 +276,7 @@ def _edges(log: Log, zero_s: float, groups: dict[str, PlacedGroup]) -> np.ndarra
         return np.empty(0)
     source, entry = log.find(wanted, "keyphasor")
     signal, axis = log.read(source, entry, "keyphasor")
-    values, axis = signal.physical, log.on_common_clock(axis, source, entry)
+    values, axis = signal.physical, log.align_clock(axis, source, entry)
     found, level = clock.find_crossings(
         values, axis, threshold=wanted.threshold, hysteresis=wanted.hysteresis, falling=wanted.edge == "falling"
     )
@@ -346,7 +346,7 @@ def _payloads(conversion: Conversion) -> Iterator[tuple[int, str, bytes]]:
     yield 0, wire.EVENTS, _event(0, "import", files=", ".join(file["name"] for file in conversion.document["files"]))
     due: list[tuple[int, str, bytes | wire.Block]] = sorted(
         [
-            *((tick, wire.EVENTS, payload) for tick, payload in _happenings(conversion)),
+            *((tick, wire.EVENTS, payload) for tick, payload in _scene_events(conversion)),
             *(block for name in conversion.counts for block in _blocks(conversion, name)),
             *_edge_blocks(conversion),
         ],
@@ -365,7 +365,7 @@ def _event(tick: int, event: str, **about: Any) -> bytes:
     return wire.encode_document({"tick": tick, "time_s": tick / TICK_RATE_HZ, "event": event, **about})
 
 
-def _happenings(conversion: Conversion) -> Iterator[tuple[int, bytes]]:
+def _scene_events(conversion: Conversion) -> Iterator[tuple[int, bytes]]:
     """Yield the commands of the scene, or the detected hammer pulses without a scene."""
     experiment = conversion.experiment
     commands = [pulse.command() for pulse in conversion.pulses] if experiment is None else experiment.commands
@@ -382,7 +382,7 @@ def _blocks(conversion: Conversion, name: str) -> Iterator[tuple[int, str, wire.
     base = round(first * rate / TICK_RATE_HZ)
     starts = [*block_starts(len(counts), first, rate), len(counts)]
     for start, stop in pairwise(starts):
-        for low, high in true_runs(present[start:stop]):
+        for low, high in find_true_runs(present[start:stop]):
             at = start + low
             values = np.ascontiguousarray(counts[at : start + high])
             block = wire.Block(round(first + at * TICK_RATE_HZ / rate), base + at, rate, float(TICK_RATE_HZ), values)

@@ -59,7 +59,7 @@ def nominal_hz(rate_hz: float) -> int:
     return max(1, round(next((each for each in candidates if abs(each / rate_hz - 1.0) < _MAX_CLOCK_ERROR), rate_hz)))
 
 
-def true_rate(axis: clock.Axis) -> float:
+def true_rate(axis: clock.TimeAxis) -> float:
     """Return the rate of even samples [Hz], rounded to a whole number if the accumulated error is negligible."""
     whole = max(1, round(axis.rate_hz))
     if abs(whole - axis.rate_hz) / axis.rate_hz * axis.rows <= clock.EVENNESS_TOLERANCE:
@@ -133,7 +133,7 @@ def _group_signals(signals: Sequence[MappedSignal], mapping: Mapping) -> dict[st
     return found
 
 
-def _share_axis(a: clock.Axis, b: clock.Axis) -> bool:
+def _share_axis(a: clock.TimeAxis, b: clock.TimeAxis) -> bool:
     """Return whether two axes have the same instants, within a small fraction of a sample from end to end."""
     if (a.times_s is None) != (b.times_s is None):
         return False
@@ -149,7 +149,7 @@ def _is_placed(entries: Sequence[MappedSignal], rate_hz: float) -> bool:
     return all(true_rate(entry.axis) == rate_hz and _share_axis(entries[0].axis, entry.axis) for entry in entries)
 
 
-def _next_sample(axis: clock.Axis, time_s: float) -> float:
+def _next_sample(axis: clock.TimeAxis, time_s: float) -> float:
     # On an axis whose rate is a whole number within `EVEN`, this is the sample's own time.
     number = math.ceil((time_s - axis.first_s) * axis.rate_hz - 1e-6)
     return axis.first_s + number / axis.rate_hz
@@ -220,12 +220,12 @@ def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str])
         if group is None or group[a].target.unit != group[b].target.unit or a == b:
             raise InputError(f"rotate.{number}.channels", "two channels of one group and unit", Words(f"{a}, {b}"))
         angles = np.radians(entry.angles_deg)
-        seen = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        if abs(np.linalg.det(seen)) < 0.1:
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        if abs(np.linalg.det(directions)) < 0.1:
             raise InputError(f"rotate.{number}.angles_deg", "different (sine of the difference 0.1 or more)",
                              list(entry.angles_deg))  # fmt: skip
         probes = f"probes at {entry.angles_deg[0]:g} and {entry.angles_deg[1]:g} deg"
-        inverse = np.linalg.inv(seen)
+        inverse = np.linalg.inv(directions)
         mixed = inverse @ np.stack([group[a].values, group[b].values])
         noises = np.hypot(*(inverse * [group[a].noise, group[b].noise]).T)
         for name, values, level in zip((a, b), mixed, noises.tolist(), strict=True):
@@ -268,7 +268,7 @@ def quantise(
             channel, column, rule = _counts(entry, name, group.rate_hz)
             channels.append(channel)
             columns.append(column)
-            imported.append(_imported(entry, channel, rule, group.rate_hz))
+            imported.append(_make_imported_channel(entry, channel, rule, group.rate_hz))
         known = default_table().groups.get(next(iter(group.channels.values())).target.group)
         title = known.title if known is not None else name
         tables[name] = Group(name=name, title=title, rate_hz=channels[0].rate_hz, channels=tuple(channels))
@@ -334,7 +334,7 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, n
     return channel, found.astype(np.int32), f"2^{round(math.log2(abs(scale)))} {channel.unit}"
 
 
-def _imported(entry: MappedSignal, channel: Channel, rule: str, rate_hz: float) -> ImportedChannel:
+def _make_imported_channel(entry: MappedSignal, channel: Channel, rule: str, rate_hz: float) -> ImportedChannel:
     unit = units.canonical(entry.mapping.unit or entry.entry.unit or "1")
     source = f"(source {'-' if entry.bias > 0.0 else '+'} {abs(entry.bias):.6g})" if entry.bias else "source"
     ratio = "" if unit == channel.unit else f" {channel.unit} per {unit}".replace(" 1 per", " per")

@@ -33,7 +33,7 @@ class MappedSignal:
     source: Source
     entry: Entry
     signal: FileSignal
-    axis: clock.Axis
+    axis: clock.TimeAxis
     target: Channel
     gain: float
     """Channel unit per source unit, with sign and factor."""
@@ -108,7 +108,7 @@ class Log:
         names = [entry.name for _, entry in inside]
         raise UnknownNameError(f"{where}.source", "a signal of the file", wanted.source, names)
 
-    def read(self, source: Source, entry: Entry, where: str) -> tuple[FileSignal, clock.Axis]:
+    def read(self, source: Source, entry: Entry, where: str) -> tuple[FileSignal, clock.TimeAxis]:
         """Return a signal and its time axis; nan for samples missing from an even one.
 
         Raises:
@@ -122,7 +122,7 @@ class Log:
             signal = replace(signal, values=axis.place_samples(signal.values.astype(float)))
         return signal, axis
 
-    def _axis(self, signal: FileSignal, what: str) -> clock.Axis:
+    def _axis(self, signal: FileSignal, what: str) -> clock.TimeAxis:
         """Return the time axis of a signal, from the file or the mapping."""
         rows, time = len(signal.values), self.mapping.time
         if time.rate_hz is not None:
@@ -131,11 +131,11 @@ class Log:
                 must = f'within {_RATE_TOLERANCE:.0%} of the {rate_hz:.6g} Hz of {what} (or file.time_column = "none")'
                 raise InputError("time.rate_hz", must, time.rate_hz)
             first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
-            return clock.Axis(first_s, time.rate_hz, rows, note="rate from the mapping")
+            return clock.TimeAxis(first_s, time.rate_hz, rows, note="rate from the mapping")
         if signal.times_s is not None:
-            return clock.axis_of_stamps(signal.times_s, line=time.stamps == "line", what=what)
+            return clock.make_axis(signal.times_s, line=time.stamps == "line", what=what)
         if signal.rate_hz is not None:
-            return clock.Axis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
+            return clock.TimeAxis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
         raise InputError("time.rate_hz", f"set, as the file has no rate for {what}", None)
 
     def take(self, name: str, wanted: ChannelMapping) -> MappedSignal:
@@ -194,7 +194,7 @@ class Log:
             for wanted, side in ((wanted_align.reference, "reference"), (wanted_align.moved, "moved")):
                 source, entry = self.find(wanted, f"{where}.{side}")
                 signal, axis = self.read(source, entry, f"{where}.{side}")
-                pairs.append((signal.physical, self.on_common_clock(axis, source, entry)))
+                pairs.append((signal.physical, self.align_clock(axis, source, entry)))
                 places.append((source, entry))
             (source, entry), (base, base_entry) = places[1], places[0]
             group = entry.group if wanted_align.scope == "group" else None
@@ -213,11 +213,11 @@ class Log:
                 f"{what}: moved by {shift.offset_s * 1e3:+.4f} ms, {shift.note} of {wanted_align.moved.source}"
             )
 
-    def on_common_clock(self, axis: clock.Axis, source: Source, entry: Entry) -> clock.Axis:
+    def align_clock(self, axis: clock.TimeAxis, source: Source, entry: Entry) -> clock.TimeAxis:
         """Return the time axis of a signal on the clock of the first file."""
         for file, group, shift in self._moves:
             if file == source.path.name and group in (None, entry.group):
-                axis = axis.shifted(shift.offset_s, shift.stretch)
+                axis = axis.shift(shift.offset_s, shift.stretch)
         return axis
 
     def _align_start_times(self) -> None:
@@ -261,7 +261,7 @@ def check_rows(signals: Sequence[MappedSignal]) -> None:
             raise InputError(f"channels.{entry.name}", "a signal of two or more values", entry.axis.rows)
 
 
-def _inside(axis: clock.Axis, mapping: Mapping) -> np.ndarray:
+def _is_inside(axis: clock.TimeAxis, mapping: Mapping) -> np.ndarray:
     times_s = axis.instants()
     low, high = mapping.time.from_s, mapping.time.to_s
     return (times_s >= (-math.inf if low is None else low)) & (times_s <= (math.inf if high is None else high))
@@ -294,7 +294,7 @@ def convert_to_engineering(entry: MappedSignal, mapping: Mapping) -> None:
         else:
             physical = np.where(bad, np.nan, physical)
     if wanted.bias == "mean":
-        inside = physical[_inside(entry.axis, mapping)]
+        inside = physical[_is_inside(entry.axis, mapping)]
         entry.bias = float(np.nanmean(inside)) if len(inside) else 0.0
     else:
         entry.bias = float(wanted.bias)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -175,6 +175,8 @@ class Source:
         options: Options that the mapping needs to read the file the same way.
     """
 
+    CUT_LAST_LINE: ClassVar[str] = "the last line is cut and was ignored"
+    """Start of the remark on a text file whose last line is incomplete."""
     path: Path
     format: str
     entries: tuple[Entry, ...]
@@ -210,7 +212,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
     if form is not FORMATS["text"]:
         options.reject_text_options(path)
     what, module = form.title, load_format(form)
-    with _parsing(path, what):
+    with _translate_errors(path, what):
         source = module.look_into(path, options)
         if not isinstance(source, Source):
             raise TypeError(f"{form.module}.look_into returns {type(source).__name__}, not Source")
@@ -221,14 +223,14 @@ def open_source(path: Path, options: FileOptions) -> Source:
 
     def read(entry: Entry) -> FileSignal:
         where = f"{what} (signal {entry.name})"
-        with _parsing(path, where):
+        with _translate_errors(path, where):
             signal = source.read(entry)
             _check(signal)
         return signal
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         assert source.pieces is not None
-        with _parsing(path, what):
+        with _translate_errors(path, what):
             for piece in source.pieces(entries):
                 for signal in piece:
                     _check(signal)
@@ -238,21 +240,21 @@ def open_source(path: Path, options: FileOptions) -> Source:
         entry if entry.rate_hz is None or 0.0 < entry.rate_hz <= MAX_RATE_HZ else replace(entry, rate_hz=None)
         for entry in source.entries
     )
-    distinct = _distinct(entries)
+    distinct = _make_distinct(entries)
     renamed = [
         f"several signals are named {one.name!r}; one is renamed to {new.name!r}"
         for one, new in zip(entries, distinct, strict=True)
         if one.name != new.name
     ]
     about = {key: text for key, text in source.about.items() if len(text) <= _MAX_PROPERTY_LENGTH}
-    documents = {name: source.about[name] for name in DOCUMENTS if name in source.about} or _beside(path)
+    documents = {name: source.about[name] for name in DOCUMENTS if name in source.about} or _read_sidecar(path)
     return replace(
         source, entries=distinct, read=read, pieces=source.pieces and pieces, about=about, documents=documents,
         remarks=(*source.remarks, *renamed),
     )  # fmt: skip
 
 
-def _beside(path: Path) -> dict[str, str]:
+def _read_sidecar(path: Path) -> dict[str, str]:
     """Return the rig's documents from FILE.json, where `rig export` writes them for formats without metadata."""
     try:
         with open_file(path.with_name(path.name + ".json")) as file:
@@ -265,14 +267,14 @@ def _beside(path: Path) -> dict[str, str]:
 
 
 @contextmanager
-def _parsing(path: Path, what: str) -> Iterator[None]:
+def _translate_errors(path: Path, what: str) -> Iterator[None]:
     """Turn any error of a library on an unreadable file, including lack of memory, into one line."""
     try:
         yield
     except InputError:
         raise
     except (Exception, SystemExit) as error:
-        raise damaged(path, what, error) from None
+        raise read_error(path, what, error) from None
 
 
 def _check(signal: FileSignal) -> None:
@@ -294,18 +296,18 @@ def _check(signal: FileSignal) -> None:
         raise ValueError(f"time stamps that are not finite numbers up to {_MAX_TIME_S:g} s, one per row")
 
 
-def _distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+def _make_distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
     """Return the entries with a number appended to names that repeat in a group."""
-    seen: dict[tuple[str, str], int] = {}
+    counts: dict[tuple[str, str], int] = {}
     found = []
     for entry in entries:
         key = (entry.group, entry.name)
-        seen[key] = seen.get(key, 0) + 1
-        found.append(entry if seen[key] == 1 else replace(entry, name=f"{entry.name} #{seen[key]}"))
+        counts[key] = counts.get(key, 0) + 1
+        found.append(entry if counts[key] == 1 else replace(entry, name=f"{entry.name} #{counts[key]}"))
     return tuple(found)
 
 
-def library(what: str, name: str, module: str | None = None) -> Any:
+def load_library(what: str, name: str, module: str | None = None) -> Any:
     """Import an optional library.
 
     Args:
@@ -328,7 +330,7 @@ def library(what: str, name: str, module: str | None = None) -> Any:
         raise RefusedError(line) from None
 
 
-def damaged(path: Path, what: str, error: BaseException | str) -> InputError:
+def read_error(path: Path, what: str, error: BaseException | str) -> InputError:
     """Return the one-line error for a file that a library cannot read."""
     text = error if isinstance(error, str) else describe_error(error)
     return InputError("file", f"an intact {what} file", Words(f"{path} ({text})"[:300]))

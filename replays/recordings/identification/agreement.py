@@ -81,7 +81,7 @@ def split_channels(parts: Mapping[str, Measured], values: Mapping[str, np.ndarra
     ]
 
 
-def centred(values: np.ndarray) -> np.ndarray:
+def subtract_mean(values: np.ndarray) -> np.ndarray:
     """Return values without the mean of each column."""
     return values - values.mean(axis=0)
 
@@ -101,7 +101,7 @@ class ChannelState:
 
 
 def approach(
-    predictor: Predictor, values: np.ndarray, known: np.ndarray, *, trusting: bool, enabled: Sequence[bool]
+    predictor: Predictor, values: np.ndarray, known: np.ndarray, *, by_residuals: bool, enabled: Sequence[bool]
 ) -> tuple[np.ndarray, ChannelState]:
     """Search values near a start on which most channels agree.
 
@@ -109,7 +109,7 @@ def approach(
         predictor: Predictor of the channels.
         values: Start of the search, shape (keys,).
         known: Means and standard deviations of the priors, shape (2, keys).
-        trusting: True: channels are weighted by their residuals from the first step on; False: by their signals.
+        by_residuals: True: channels are weighted by their residuals from the first step on; False: by their signals.
         enabled: Channels that are used.
 
     Returns:
@@ -123,8 +123,8 @@ def approach(
         slopes = predictor.derivatives(values).slopes
         by_key = [[one / floor for one, floor in split_channels(predictor.parts, slope)] for slope in slopes]
         here = ChannelState(here.apart, [np.column_stack(columns) for columns in zip(*by_key, strict=True)])
-        say = [max(1.0, rms(z)) for z in here.apart] if trusting else signal_sizes(predictor.parts)
-        step = solve_weighted(here.apart, here.slopes, say, (means - values, deviations), enabled)
+        channel_weights = [max(1.0, rms(z)) for z in here.apart] if by_residuals else signal_sizes(predictor.parts)
+        step = solve_weighted(here.apart, here.slopes, channel_weights, (means - values, deviations), enabled)
         cost = here.cost((values - means) / deviations, enabled)
         for part in _STEP_FRACTIONS:
             moved = np.clip(values + part * step, low, high)
@@ -166,11 +166,11 @@ def search_restarts(predictor: Predictor, values: np.ndarray, places: list[int],
 
     best = cost(values), values
     for place in places:
-        tried = [best]
+        candidates = [best]
         for part in _RESTART_FACTORS:
             (moved := best[1].copy())[place] = part * values[place]
-            tried.append((cost(moved), moved))
-        best = min(tried, key=lambda one: one[0])
+            candidates.append((cost(moved), moved))
+        best = min(candidates, key=lambda one: one[0])
     return best[1]
 
 

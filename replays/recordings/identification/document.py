@@ -13,7 +13,7 @@ from rig.base.errors import check_new_file, whole_file
 from rig.physics.parameters import DEFAULT_SET, Parameter, load_parameters, set_names
 
 
-def fitted_set(found: Identification, *, recording: str) -> str:
+def format_set(found: Identification, *, recording: str) -> str:
     """Return the parameter set as TOML: the set of the experiment with the identified values replaced.
 
     Values that are not seen keep their start. Values that are only seen together are all written as fitted, with a

@@ -94,7 +94,7 @@ class Judgement:
     @property
     def fits(self) -> bool:
         """True if the residuals are no larger than the noise."""
-        return _explained(self.chi2, self.freedom)
+        return _is_explained(self.chi2, self.freedom)
 
     @property
     def white(self) -> bool:
@@ -131,19 +131,19 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     quantile = float(student(freedom))
     unsure = _CHI2_TOLERANCE if "measured" in observation.noise_from else 0.0
     spread = 1.0 + _ERROR_RATIO * _misfit(residuals, known, unsure) / quantile
-    seen = quantile * spread < singular  # the 95 % interval along the direction is within the reach
-    blind = directions[~seen].T
+    observable = quantile * spread < singular  # the 95 % interval along the direction is within the reach
+    blind = directions[~observable].T
     part = np.linalg.norm(blind, axis=1) if blind.size else np.zeros(len(unknowns))
     alone = quantile * spread > np.linalg.norm(slopes * reach, axis=(0, 1))
 
-    kept = directions[seen].T / singular[seen]
+    kept = directions[observable].T / singular[observable]
     plain = kept @ kept.T  # covariance of z / reach from the noise alone
     noise_only = np.sqrt(np.diag(plain))
     covariance = plain * spread**2
     channels = tuple(
         _channel(name, residuals[:, column], known[:, column]) for column, name in enumerate(observation.names)
     )
-    if not _explained(chi2, freedom) or sum(not channel.white for channel in channels) > len(channels) // 10:
+    if not _is_explained(chi2, freedom) or sum(not channel.white for channel in channels) > len(channels) // 10:
         covariance = _max_covariance(covariance, plain @ _scores(slopes * reach, residuals) @ plain)
     stretch = _widenings(window, z, covariance * np.outer(reach, reach), residuals, known, far=quantile, spread=spread)
     covariance = _with_priors(covariance * np.outer(stretch, stretch), unknowns, reach)
@@ -156,7 +156,7 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     for place, unknown in enumerate(unknowns):
         half = quantile * deviation[place] * unknown.reach
         finding = _finding(place, unknowns, float(values[place]), half, alone=alone, blind=blind, part=part)
-        findings.append(finding if _explained(chi2, freedom) else _unexplained(finding))
+        findings.append(finding if _is_explained(chi2, freedom) else _drop_result(finding))
     correlation = np.full(covariance.shape, np.nan)
     identified = np.array([finding.standing == "identified" for finding in findings])
     both = np.outer(identified, identified) & (np.outer(deviation, deviation) > 0.0)
@@ -167,7 +167,7 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
         singular_values=singular,
         chi2=chi2,
         freedom=freedom,
-        together=_together_factor(correlation[np.ix_(identified, identified)]),
+        together=_simultaneous_factor(correlation[np.ix_(identified, identified)]),
         inflation=inflation,
         channels=channels,
     )
@@ -189,7 +189,7 @@ def _misfit(residuals: np.ndarray, known: np.ndarray, unsure: float) -> float:
     return math.sqrt(max(0.0, float(beyond[counts >= min(_MIN_ROWS, counts[-1])].max())))
 
 
-def _unexplained(finding: Finding) -> Finding:
+def _drop_result(finding: Finding) -> Finding:
     """Return the finding without a result, for a model that does not explain the samples."""
     if finding.standing in ("not seen", "only together"):
         return finding
@@ -200,11 +200,11 @@ def _unexplained(finding: Finding) -> Finding:
     return Finding(finding.unknown, finding.value, math.inf, "not explained", words)
 
 
-def _explained(chi2: float, freedom: int) -> bool:
+def _is_explained(chi2: float, freedom: int) -> bool:
     return chi2 < 1.0 + _CHI2_TOLERANCE + _CHI2_SIGMAS * math.sqrt(2.0 / freedom)
 
 
-def _together_factor(correlation: np.ndarray) -> float:
+def _simultaneous_factor(correlation: np.ndarray) -> float:
     """Return the width of simultaneous 95 % intervals over that of single ones, by Monte Carlo."""
     if len(correlation) < 2:
         return 1.0
@@ -238,9 +238,9 @@ def _finding(
 ) -> Finding:
     unknown = unknowns[place]
     if alone[place]:
-        return Finding(unknown, value, math.inf, "not seen", _not_seen(unknown))
+        return Finding(unknown, value, math.inf, "not seen", _describe_unseen(unknown))
     if part[place] > _MIN_PART:
-        return Finding(unknown, value, math.inf, "only together", _together(place, unknowns, blind))
+        return Finding(unknown, value, math.inf, "only together", _describe_inseparable(place, unknowns, blind))
     if min(value - unknown.low, unknown.high - value) < 1e-6 * unknown.scale:
         return Finding(unknown, value, math.inf, "at its bound", "at its bound: no interval")
     return widen_interval(Finding(unknown, value, half, "identified", "identified"), 0.0)
@@ -255,21 +255,21 @@ def widen_interval(finding: Finding, by: float) -> Finding:
     """
     half = finding.half_width + by
     if finding.standing == "identified" and half > finding.unknown.reach:
-        return Finding(finding.unknown, finding.value, math.inf, "not seen", _not_seen(finding.unknown))
+        return Finding(finding.unknown, finding.value, math.inf, "not seen", _describe_unseen(finding.unknown))
     return replace(finding, half_width=half)
 
 
-def _not_seen(unknown: Unknown) -> str:
+def _describe_unseen(unknown: Unknown) -> str:
     known = "the prior" if unknown.prior is not None else "the bounds" if unknown.bounded else "the value itself"
     return f"not seen in this window: its interval would be wider than {known}"
 
 
-def _together(place: int, unknowns: tuple[Unknown, ...], blind: np.ndarray) -> str:
+def _describe_inseparable(place: int, unknowns: tuple[Unknown, ...], blind: np.ndarray) -> str:
     """Return the unknowns that one cannot be separated from, and the changes that compensate each other."""
     direction = blind[:, int(np.argmax(np.abs(blind[place])))]
     others = [n for n in np.argsort(-np.abs(direction)) if n != place and abs(direction[n]) > _MIN_PART]
     if not others:
-        return _not_seen(unknowns[place])
+        return _describe_unseen(unknowns[place])
     change = 0.01 * unknowns[place].scale
     rates = [change * direction[n] * unknowns[n].reach / (direction[place] * unknowns[place].reach) for n in others]
     compensation = " and ".join(

@@ -63,11 +63,11 @@ def identify_log(
         recording, first.experiment, (*keys, *(key for key in NUISANCES if key not in keys)), known=priors or {},
         channels=channels, to_s=to_s, progress=progress,
     )  # fmt: skip
-    nuisances = find_nuisances(tuned.begun, NUISANCES, excluded=keys)
+    nuisances = find_nuisances(tuned.baseline, NUISANCES, excluded=keys)
     all_priors = {key: known for key, known in nuisances.items() if known is not None} | dict(priors or {})
     question = ask(
-        recording, tuned.begun, (*keys, *nuisances), start=tuned.values, bounds=bounds, priors=all_priors,
-        nuisances=nuisances, channels=channels, window=(window_start_s(tuned.begun), tuned.end_s),
+        recording, tuned.baseline, (*keys, *nuisances), start=tuned.values, bounds=bounds, priors=all_priors,
+        nuisances=nuisances, channels=channels, window=(window_start_s(tuned.baseline), tuned.end_s),
     )  # fmt: skip
     progress("effect of filters with other corners")
     other = {name: part.with_corner_factor(bandwidth) for name, part in question.observation.parts.items()}
@@ -89,7 +89,9 @@ def identify_log(
     moved = np.hypot(jackknife, moves)
     shown = [residuals - apart / louder]
     for changes in variants:
-        shown.append(_window(replace(question, experiment=question.experiment.changed(dict(changes)))).residuals(z))
+        shown.append(
+            _window(replace(question, experiment=question.experiment.with_changes(dict(changes)))).residuals(z)
+        )
     flat = slopes.reshape(-1, len(scale))
     for one in shown:
         change = solve_normal(square + flat.T @ flat, flat.T @ np.nan_to_num(one - residuals).ravel())

@@ -19,7 +19,6 @@ from replays.recordings.identification.agreement import (
     MAX_PRIOR_DEVIATION,
     ChannelState,
     approach,
-    centred,
     evaluate,
     jackknife_half_widths,
     rms,
@@ -27,18 +26,12 @@ from replays.recordings.identification.agreement import (
     signal_sizes,
     solve_weighted,
     split_channels,
+    subtract_mean,
 )
 from replays.recordings.identification.request import first_command_s, observe
 from replays.recordings.resimulation.experiment import PICKUP_S, Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction
-from replays.recordings.resimulation.sensitivity import (
-    ANGLE,
-    STATE,
-    Predictor,
-    to_model_clock,
-    value_of,
-    with_values,
-)
+from replays.recordings.resimulation.sensitivity import ANGLE, STATE, Predictor, get_value, to_model_clock, with_values
 from rig.base.errors import InputError, Words
 from rig.run.simulation import TICK_RATE_HZ
 
@@ -130,7 +123,7 @@ class Tuned:
     """Imported log with its fitted experiment.
 
     Attributes:
-        begun: Experiment before the fit.
+        baseline: Experiment before the fit.
         experiment: Experiment with the fitted values; those of a hammer pulse are rounded to rows.
         fitted: Fitted values with their intervals.
         values: Fitted values by key.
@@ -143,7 +136,7 @@ class Tuned:
         scales: Residual rms over noise of each channel, at least 1.
     """
 
-    begun: Experiment
+    baseline: Experiment
     experiment: Experiment
     fitted: tuple[Fitted, ...]
     values: dict[str, float]
@@ -158,30 +151,30 @@ class Tuned:
         """Return channels of the log on the model's clock."""
         return to_model_clock(parts, self.values, about_s=self.about_s)
 
-    def better_than(self, other: Tuned) -> bool:
+    def is_better_than(self, other: Tuned) -> bool:
         """Return whether this fit explains a longer window, or an equal one with smaller residuals."""
         left, its = (sum(math.log(scale) for scale in one.scales.values()) for one in (self, other))
         return (self.end_s, -left) > (other.end_s, -its)
 
-    def changed(self, changes: dict[str, Any]) -> Tuned:
+    def with_changes(self, changes: dict[str, Any]) -> Tuned:
         """Return the same values with another model."""
-        return replace(self, begun=self.begun.changed(changes))
+        return replace(self, baseline=self.baseline.with_changes(changes))
 
     def undo_last_growth(self) -> Tuned:
         """Return the values before the last growth of the window, which were equally valid on that window."""
         moved = zip(self.values.items(), self.moves[-1].tolist(), strict=True)
-        return replace(self, values=_restrict(self.begun, {key: value - by for (key, value), by in moved}))
+        return replace(self, values=_restrict(self.baseline, {key: value - by for (key, value), by in moved}))
 
     def draw_values(self, generator: np.random.Generator) -> Tuned:
         """Return values drawn from the uncertainty of the fit and of the model."""
         off = draw_normal(self.covariance, generator, 1)[0]
         off += generator.standard_normal(len(self.moves)) @ self.moves
         moved = {key: value + d for (key, value), d in zip(self.values.items(), off.tolist(), strict=True)}
-        return replace(self, values=_restrict(self.begun, moved))
+        return replace(self, values=_restrict(self.baseline, moved))
 
     def predict(self, parts: dict[str, Measured]) -> Prediction:
         """Return the prediction of channels of the log, on its own clock."""
-        predictor = Predictor(self.begun, tuple(self.values), parts, about_s=self.about_s)
+        predictor = Predictor(self.baseline, tuple(self.values), parts, about_s=self.about_s)
         return predictor.predict(tuple(self.values.values()))
 
 
@@ -202,7 +195,7 @@ def find_nuisances(
         if key in excluded:
             continue
         try:
-            value = value_of(experiment, key)
+            value = get_value(experiment, key)
         except InputError:
             continue  # no hammer pulse
         deviation = experiment.unsure.get(key) or _DEVIATIONS.get(key) or _RELATIVE.get(key, 0.0) * abs(value)
@@ -238,8 +231,8 @@ def fit_initial_state(recording: Recording, experiment: Experiment) -> Experimen
     for c, (measured, floor) in enumerate(split_channels(parts, {name: part.values for name, part in parts.items()})):
         slopes = [(ahead[c] - behind[c]) / 2.0, beside[c] - middle[c], *(one[c] - ahead[c] for one in moved)]
         # The zero of a probe is unknown, so the mean of each channel is removed.
-        target.append(centred(measured - middle[c]) / floor)
-        columns.append(centred(np.column_stack(slopes)) / floor)
+        target.append(subtract_mean(measured - middle[c]) / floor)
+        columns.append(subtract_mean(np.column_stack(slopes)) / floor)
     found = solve_weighted(target, columns, signal_sizes(parts))
     moves = np.array([*found[2:], 0.0]) * predictor.scales
     values = dict(zip(keys, (still + moves).tolist(), strict=True))
@@ -251,7 +244,7 @@ def _with_edge_speed(recording: Recording, experiment: Experiment) -> Experiment
 
     If edges and tachometer disagree, the speed with the stronger motion of the probes is used.
     """
-    first_s, told_hz = first_command_s(experiment) or math.inf, experiment.scene.drive.speed_hz
+    first_s, tachometer_hz = first_command_s(experiment) or math.inf, experiment.scene.drive.speed_hz
     edges_s = recording.edges()
     edges_s = edges_s[edges_s < first_s]
     edges_s = edges_s[edges_s > edges_s[-1:].sum() - _EDGES_LENGTH_S] if len(edges_s) else edges_s
@@ -260,18 +253,18 @@ def _with_edge_speed(recording: Recording, experiment: Experiment) -> Experiment
     steps = np.diff(edges_s)
     turns = np.rint(steps / np.median(steps)).sum()  # one step is two turns if an edge is missing
     speed_hz = float(turns / (edges_s[-1] - edges_s[0]))
-    if abs(speed_hz - told_hz) > _MAX_SPEED_MISMATCH * told_hz > 0.0:
+    if abs(speed_hz - tachometer_hz) > _MAX_SPEED_MISMATCH * tachometer_hz > 0.0:
         parts = observe(recording, experiment, window=(window_start_s(experiment), first_s - _MARGIN_S)).parts
-        speed_hz = max(speed_hz, told_hz, key=lambda hz: _power_at(parts, hz))
+        speed_hz = max(speed_hz, tachometer_hz, key=lambda hz: _compute_power(parts, hz))
     return with_values(experiment, {"drive.speed_hz": speed_hz})
 
 
-def _power_at(parts: Mapping[str, Measured], speed_hz: float) -> float:
+def _compute_power(parts: Mapping[str, Measured], speed_hz: float) -> float:
     """Return the power of the channels at a speed over their noise, without mean and drift."""
     found = 0.0
     for part in parts.values():
         turning = np.exp(2j * math.pi * speed_hz * part.times_s) * np.hanning(len(part.times_s))
-        found += float(np.sum(np.abs(turning @ (centred(part.values) / part.floor)) ** 2)) / len(part.times_s)
+        found += float(np.sum(np.abs(turning @ (subtract_mean(part.values) / part.floor)) ** 2)) / len(part.times_s)
     return found
 
 
@@ -314,36 +307,36 @@ def tune(
         InputError: There are no samples, or none before the pulse.
     """
     progress("speed, angle and position of the shaft before the hammer pulse")
-    begun = fit_initial_state(recording, experiment) if ANGLE in keys else experiment
-    wanted = find_nuisances(begun, keys) | dict(known or {})
-    first_s = _pulse_time_s(begun)
-    if first_s <= window_start_s(begun):
+    baseline = fit_initial_state(recording, experiment) if ANGLE in keys else experiment
+    wanted = find_nuisances(baseline, keys) | dict(known or {})
+    first_s = _pulse_time_s(baseline)
+    if first_s <= window_start_s(baseline):
         must = (
             f"a log that begins more than {1e3 * _SETTLING_S:g} ms before the hammer pulse, for the state of the shaft"
         )
         raise InputError("file", must, Words(f"{recording.path}, with the pulse at {first_s:.4g} s"))
     end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
-    whole = observe(recording, begun, channels=channels, window=(window_start_s(begun), end_s)).parts
+    whole = observe(recording, baseline, channels=channels, window=(window_start_s(baseline), end_s)).parts
     whole = {name: part.remove_delays(late_s or {}) for name, part in whole.items()}
     whole = {name: _decimate(part, first_s - _FULL_RATE_S) for name, part in whole.items()}
-    found = _fit_best(begun, wanted, whole, progress)
-    if max(found.scales) > _FAULTY_RMS and (early := _with_earlier_pulse(begun, whole)) is not None:
-        other = _fit_windows(early, wanted, whole, progress, trusting=True, without=("hammer",))
+    found = _fit_best(baseline, wanted, whole, progress)
+    if max(found.scales) > _FAULTY_RMS and (early := _with_earlier_pulse(baseline, whole)) is not None:
+        other = _fit_windows(early, wanted, whole, progress, by_residuals=True, without=("hammer",))
         if other.rank() > found.rank():
-            begun, found = early, other
+            baseline, found = early, other
     far = [key for key, value in zip(wanted, found.values, strict=True) if _is_beyond(float(value), wanted[key])]
     if far:
         widened = wanted | {key: (one[0], _PRIOR_WIDENING * one[1]) for key in far if (one := wanted[key]) is not None}
-        found = max(found, _fit_best(begun, widened, whole, progress), key=_WindowFit.rank)
+        found = max(found, _fit_best(baseline, widened, whole, progress), key=_WindowFit.rank)
     half = np.hypot(1.96 * np.sqrt(np.diag(found.covariance) + np.mean(found.moves**2, axis=0)), found.jackknife)
     fitted = dict(zip(wanted, found.values.tolist(), strict=True))
     # A prior keeps its width, around the prior mean.
     prior_widths = [1.96 * math.hypot(one[1], fitted[key] - one[0]) if one else math.inf for key, one in wanted.items()]
     return Tuned(
-        begun=begun,
-        experiment=with_values(begun, fitted),
+        baseline=baseline,
+        experiment=with_values(baseline, fitted),
         fitted=tuple(
-            Fitted(key, value_of(experiment, key), value, width, wanted[key])
+            Fitted(key, get_value(experiment, key), value, width, wanted[key])
             for (key, value), width in zip(fitted.items(), np.minimum(half, prior_widths).tolist(), strict=True)
         ),
         values=fitted,
@@ -362,7 +355,7 @@ def _restrict(experiment: Experiment, values: dict[str, float]) -> dict[str, flo
         with_values(experiment, values)
     except InputError:
         if len(values) == 1:
-            return {key: value_of(experiment, key) for key in values}
+            return {key: get_value(experiment, key) for key in values}
         each = (_restrict(experiment, {key: value}) for key, value in values.items())
         return {key: value for one in each for key, value in one.items()}
     return values
@@ -399,75 +392,75 @@ class _WindowFit:
 
 
 def _fit_best(
-    begun: Experiment,
+    baseline: Experiment,
     wanted: dict[str, tuple[float, float] | None],
     whole: dict[str, Measured],
     progress: Callable[[str], None],
 ) -> _WindowFit:
     """Return the best of several fits; if channels disagree, also fit by the majority, with and without the hammer."""
-    found = _fit_windows(begun, wanted, whole, progress, trusting=False)
+    found = _fit_windows(baseline, wanted, whole, progress, by_residuals=False)
     for without in ((), ("hammer",)):
-        early = without and found.end_s <= _pulse_time_s(begun) + _WINDOWS_S[0]  # its own time
+        early = without and found.end_s <= _pulse_time_s(baseline) + _WINDOWS_S[0]  # its own time
         if early or (max(found.scales) > _FAULTY_RMS and (found.median_scale > _FAULTY_RMS or not without)):
-            other = _fit_windows(begun, wanted, whole, progress, trusting=True, without=without)
+            other = _fit_windows(baseline, wanted, whole, progress, by_residuals=True, without=without)
             found = max(found, other, key=_WindowFit.rank)
     return found
 
 
-def _with_earlier_pulse(begun: Experiment, whole: dict[str, Measured]) -> Experiment | None:
+def _with_earlier_pulse(baseline: Experiment, whole: dict[str, Measured]) -> Experiment | None:
     """Return the experiment with the pulse at the time that most channels show; None if that of the hammer is best."""
-    if not (first_s := first_command_s(begun)) or begun.begin is None:
+    if not (first_s := first_command_s(baseline)) or baseline.begin is None:
         return None
     # Earlier samples do not depend on the time of the pulse.
     low_s, high_s = first_s - _SEARCH_S, first_s + _WINDOWS_S[0]
-    parts = {name: part.until(high_s).starting_at(low_s) for name, part in whole.items()}
-    predictor, at_s = Predictor(begun, (_PULSE,), parts), value_of(begun, _PULSE)
+    parts = {name: part.select_until(high_s).select_from(low_s) for name, part in whole.items()}
+    predictor, at_s = Predictor(baseline, (_PULSE,), parts), get_value(baseline, _PULSE)
 
     def left(late_s: float) -> float:
         here = evaluate(predictor, np.array([at_s + late_s]))
         return math.inf if here is None else sum(math.log(max(1.0, rms(z))) for z in here.apart)
 
     late_s = min(np.linspace(-_SEARCH_S, _SEARCH_S, 41).tolist(), key=left)
-    return with_values(begun, {_PULSE: at_s + late_s}) if left(late_s) < left(0.0) else None
+    return with_values(baseline, {_PULSE: at_s + late_s}) if left(late_s) < left(0.0) else None
 
 
 def _fit_windows(
-    begun: Experiment,
+    baseline: Experiment,
     wanted: dict[str, tuple[float, float] | None],
     whole: dict[str, Measured],
     progress: Callable[[str], None],
     *,
-    trusting: bool,
+    by_residuals: bool,
     without: Sequence[str] = (),
 ) -> _WindowFit:
     """Fit in windows that grow from the pulse.
 
     Args:
-        begun: The experiment.
+        baseline: Experiment before the fit.
         wanted: Keys to fit, with their priors.
         whole: The samples.
         progress: Callback for the current step.
-        trusting: Weight channels by their residuals from the first step on, starting from the logged values.
+        by_residuals: Weight channels by their residuals from the first step on, starting from the logged values.
         without: Channels that are not used.
     """
-    first_s, every = _pulse_time_s(begun), [name not in without for part in whole.values() for name in part.names]
-    values = np.array([value_of(begun, key) for key in wanted])
+    first_s, every = _pulse_time_s(baseline), [name not in without for part in whole.values() for name in part.names]
+    values = np.array([get_value(baseline, key) for key in wanted])
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
     jackknife = np.zeros(len(values))
     for length in _WINDOWS_S:
         progress(f"{len(wanted)} nuisance parameters: to {first_s + length:.3f} s")
-        parts = {name: part.until(first_s + length) for name, part in whole.items()}
-        predictor = Predictor(begun, tuple(wanted), parts)
+        parts = {name: part.select_until(first_s + length) for name, part in whole.items()}
+        predictor = Predictor(baseline, tuple(wanted), parts)
         # Without a prior, a value is held so weakly that only one without any effect keeps its start.
         loose = zip(predictor.start, predictor.scales, strict=True)
         known = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
 
         def fitted(start: np.ndarray) -> tuple[np.ndarray, ChannelState, list[float]]:
-            found, here = approach(predictor, start, known, trusting=trusting, enabled=every)  # noqa: B023
+            found, here = approach(predictor, start, known, by_residuals=by_residuals, enabled=every)  # noqa: B023
             enabled = [has and rms(z) <= _FAULTY_RMS for z, has in zip(here.apart, every, strict=True)]
             if len(enabled) / 2.0 < sum(enabled) < len(enabled):
                 # Faulty channels are left out: even a small weight would move values that no other channel shows.
-                found, here = approach(predictor, found, known, trusting=True, enabled=enabled)  # noqa: B023
+                found, here = approach(predictor, found, known, by_residuals=True, enabled=enabled)  # noqa: B023
             return found, here, [max(1.0, rms(z)) for z in here.apart]
 
         found, here, now = fitted(values)

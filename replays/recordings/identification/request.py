@@ -11,8 +11,8 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import Measured, measured
-from replays.recordings.resimulation.sensitivity import ANGLE, CLOCK, STATE, scale_of, value_of, with_values
+from replays.recordings.resimulation.prediction import Measured, read_measured
+from replays.recordings.resimulation.sensitivity import ANGLE, CLOCK, STATE, get_scale, get_value, with_values
 from rig.base.errors import InputError
 from rig.base.text import find_similar
 from rig.base.wire import sensor_key
@@ -99,16 +99,16 @@ class Observation:
     rows: dict[str, np.ndarray]
     every: int = 1
 
-    def until(self, end_s: float) -> int:
+    def count_rows(self, end_s: float) -> int:
         """Return the number of rows before a time."""
         return int(np.searchsorted(self.times_s, end_s - 1e-9))
 
-    def parts_until(self, rows: int) -> dict[str, Measured]:
+    def select_parts(self, rows: int) -> dict[str, Measured]:
         """Return the groups, restricted to the first rows."""
         ends = {name: int(np.searchsorted(self.rows[name], rows)) for name in self.parts}
-        return {name: self.parts[name].first(end) for name, end in ends.items() if end}
+        return {name: self.parts[name].select_first(end) for name, end in ends.items() if end}
 
-    def placed(self, values: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
+    def tabulate(self, values: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
         """Return values by group as one table, nan without a sample, shape (rows, channels)."""
         found = np.full((rows, len(self.names)), np.nan)
         for name, held in values.items():
@@ -176,12 +176,12 @@ def ask(
         _check_key(experiment, key)
     rules = {key: experiment.scene.load_parameters().rule(key) for key in keys if key in load_parameters().entries}
     centres = {key: mean for key, (mean, _) in (priors or {}).items()} | dict(start or {})
-    values = {key: centres.get(key, value_of(experiment, key)) for key in keys}
+    values = {key: centres.get(key, get_value(experiment, key)) for key in keys}
     # An angle is relative to that of the experiment.
-    begun = with_values(experiment, {key: value for key, value in values.items() if key != ANGLE})
+    baseline = with_values(experiment, {key: value for key, value in values.items() if key != ANGLE})
     unknowns = []
     for key in keys:
-        low, high = (bounds or {}).get(key) or _accepted(key)
+        low, high = (bounds or {}).get(key) or _accepted_range(key)
         if not low < high or not low <= values[key] <= high:
             raise InputError(f"bounds of {key}", f"ascending and around the start {values[key]:g}", [low, high])
         prior = (priors or {}).get(key)
@@ -190,9 +190,9 @@ def ask(
         unknowns.append(
             Unknown(
                 key=key,
-                unit=unit_of(key),
+                unit=fit_unit(key),
                 start=values[key],
-                scale=scale_of(begun, key),
+                scale=get_scale(baseline, key),
                 low=low,
                 high=high,
                 bounded=key in (bounds or {}),
@@ -201,7 +201,7 @@ def ask(
                 nuisance=key in nuisances,
             )
         )
-    return Question(begun, tuple(unknowns), observe(recording, begun, channels=channels, window=window))
+    return Question(baseline, tuple(unknowns), observe(recording, baseline, channels=channels, window=window))
 
 
 def observe(
@@ -228,8 +228,8 @@ def observe(
     missing = [name for name in wanted if name not in usable]
     if missing or not wanted:
         raise InputError("channels", f"channels of the recording: {', '.join(usable)}", ", ".join(missing))
-    whole = measured(recording, experiment.scene)
-    whole = {name: whole[name].only(wanted) for name in dict.fromkeys(groups[name] for name in wanted)}
+    whole = read_measured(recording, experiment.scene)
+    whole = {name: whole[name].select_channels(wanted) for name in dict.fromkeys(groups[name] for name in wanted)}
     first_s = max(float(part.times_s[0]) for part in whole.values())
     last_s = min(float(part.times_s[-1]) for part in whole.values())
     start_s, end_s = window
@@ -261,7 +261,7 @@ def observe(
         rows={name: np.searchsorted(union, held) for name, held in stamps.items()},
         every=every,
     )
-    values = observation.placed({name: part.values for name, part in parts.items()}, len(union))
+    values = observation.tabulate({name: part.values for name, part in parts.items()}, len(union))
     return replace(observation, values=values)
 
 
@@ -273,14 +273,14 @@ def _with_noise(part: Measured) -> Measured:
     """Return the part with the noise of the table and of rounding; measured where the table has none."""
     floor = np.array(
         [
-            channel_noise(channel) if _has_noise(part, c) else measured_noise(part.values[:, c])
+            channel_noise(channel) if _has_noise(part, c) else measure_noise(part.values[:, c])
             for c, channel in enumerate(part.channels)
         ]
     )
     return replace(part, floor=floor)
 
 
-def measured_noise(values: np.ndarray) -> float:
+def measure_noise(values: np.ndarray) -> float:
     """Return the noise of a smooth signal from its third differences, few of which are affected by impacts."""
     differences = np.diff(values[np.isfinite(values)], 3)
     spread = float(np.median(np.abs(differences))) / (0.6745 * math.sqrt(20.0)) if len(differences) else 0.0
@@ -307,7 +307,7 @@ def _check_key(experiment: Experiment, key: str) -> None:
     if key in own:
         return
     if len(key.split(".")) == 3 and key.split(".")[0] in COMMANDS:
-        value_of(experiment, key)
+        get_value(experiment, key)
         return
     close = find_similar(key, own)
     must = "of a parameter, a number of the scene ("
@@ -319,7 +319,7 @@ def _check_key(experiment: Experiment, key: str) -> None:
     raise InputError("fit", must, key)
 
 
-def _accepted(key: str) -> tuple[float, float]:
+def _accepted_range(key: str) -> tuple[float, float]:
     entries = load_parameters().entries
     if key in entries:
         return entries[key].range
@@ -327,7 +327,7 @@ def _accepted(key: str) -> tuple[float, float]:
     return UNBOUNDED if each is None else (each.low, each.high)
 
 
-def unit_of(key: str) -> str:
+def fit_unit(key: str) -> str:
     """Return the unit of a value that can be fitted; empty if unknown."""
     if key in CLOCK:
         return CLOCK[key][0]

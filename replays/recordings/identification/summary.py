@@ -19,9 +19,9 @@ from replays.report.canvas import (
     PINK,
     RED,
     SKY,
+    add_legend,
+    axis_label,
     house_style,
-    label_of,
-    legend_below,
     new_figure,
 )
 
@@ -89,7 +89,7 @@ def fit_line(found: Identification) -> str:
     return line
 
 
-def report_of(found: Identification, *, recording: str, origin: Mapping[str, str] | None = None) -> Report:
+def make_report(found: Identification, *, recording: str, origin: Mapping[str, str] | None = None) -> Report:
     """Return the report of a fit.
 
     Args:
@@ -181,11 +181,11 @@ def overlay(found: Identification) -> Figure:
     for (left, right), place in zip(panels, shown, strict=True):
         left.plot(times_s, observation.values[: window.rows, place], "o", color=ORANGE, ms=3.5, label="recorded")
         left.plot(times_s, predicted[:, place], color=BLUE, lw=1.1, label="fitted")
-        left.set_ylabel(label_of(observation.names[place], observation.units[place]).replace(" ", "\n"))
+        left.set_ylabel(axis_label(observation.names[place], observation.units[place]).replace(" ", "\n"))
         right.plot(times_s, residuals[:, place], ".", color=RED, ms=3.5, label="residual over noise [1]")
     for axes in panels[-1]:
         axes.set_xlabel("simulated time [s]")
-    legend_below(figure, *panels[0])
+    add_legend(figure, *panels[0])
     return figure
 
 
@@ -219,5 +219,5 @@ def growth(found: Identification) -> Figure:
         value = found.judgement.correlation[row, place]
         right.text(place, row, f"{value:+.2f}", ha="center", va="center", color="white" if abs(value) > 0.6 else BLACK)
     figure.colorbar(image, ax=right, label="correlation [1]", shrink=0.8)
-    legend_below(figure, left)
+    add_legend(figure, left)
     return figure

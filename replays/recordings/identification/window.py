@@ -28,8 +28,8 @@ class Window:
         self.question = question
         self.end_s = end_s
         observation = question.observation
-        self.rows = observation.until(end_s)
-        self._predictor = Predictor(question.experiment, question.keys, observation.parts_until(self.rows))
+        self.rows = observation.count_rows(end_s)
+        self._predictor = Predictor(question.experiment, question.keys, observation.select_parts(self.rows))
         self._start = np.array([unknown.start for unknown in question.unknowns])
         self._scale = np.array([unknown.scale for unknown in question.unknowns])
         self._measured = observation.values[: self.rows] / observation.noise
@@ -53,7 +53,7 @@ class Window:
         """
         observation = self.question.observation
         found = self._predictor.predict(self.values(z))
-        return observation.placed(found.values, self.rows) / observation.noise
+        return observation.tabulate(found.values, self.rows) / observation.noise
 
     def residuals(self, z: np.ndarray) -> np.ndarray:
         """Return measured minus predicted over the noise, 0 for lost samples, shape (rows, channels)."""
@@ -92,7 +92,7 @@ class Window:
         """Return the slopes by each value alone, in the predictor's own steps, shape (rows, channels, unknowns)."""
         observation = self.question.observation
         found = self._predictor.derivatives(self.values(z)).slopes
-        columns = [observation.placed(one, self.rows) * s for one, s in zip(found, self._scale, strict=True)]
+        columns = [observation.tabulate(one, self.rows) * s for one, s in zip(found, self._scale, strict=True)]
         return np.nan_to_num(np.stack(columns, axis=-1) / observation.noise[:, None])
 
     def _side(self, z: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

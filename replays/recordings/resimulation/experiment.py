@@ -50,7 +50,7 @@ class Experiment:
     unsure: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, recording: Recording) -> Self:
+    def from_recording(cls, recording: Recording) -> Self:
         """Return the experiment of a recording of this rig.
 
         Raises:
@@ -75,7 +75,7 @@ class Experiment:
         unsure = recording.scene.get("import", {}).get("unsure", {})
         return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=unsure)
 
-    def changed(self, changes: dict[str, Any]) -> Experiment:
+    def with_changes(self, changes: dict[str, Any]) -> Experiment:
         """Return the experiment with other values of scene or parameters, by dotted key, each in its own unit.
 
         Raises:
@@ -90,7 +90,7 @@ class Experiment:
         return replace(self, scene=self.scene.model_copy(update={"commands": kept}), commands=sent)
 
     @property
-    def faulty(self) -> set[str]:
+    def faulty_channels(self) -> set[str]:
         """Channels that have a fault at some time."""
         timed = [one.request for one in self.scene.commands] + [
             check_command(one.name, dict(one.request)) for one in self.commands if one.name == "fault"

@@ -72,24 +72,24 @@ class Measured:
         """Channel names, in column order."""
         return tuple(channel.name for channel in self.channels)
 
-    def rows_until(self, end_s: float) -> int:
+    def count_rows(self, end_s: float) -> int:
         """Return the number of rows before a time."""
         return int(np.searchsorted(self.times_s, end_s))
 
-    def until(self, end_s: float) -> Measured:
+    def select_until(self, end_s: float) -> Measured:
         """Return the rows before a time."""
-        return self.first(self.rows_until(end_s))
+        return self.select_first(self.count_rows(end_s))
 
-    def starting_at(self, begin_s: float) -> Measured:
+    def select_from(self, begin_s: float) -> Measured:
         """Return the rows from a time on."""
-        return self.select_rows(slice(self.rows_until(begin_s), None))
+        return self.select_rows(slice(self.count_rows(begin_s), None))
 
     def with_corner_factor(self, factor: float) -> Measured:
         """Return the channels with low-passes of other corners."""
         corners = ((channel, channel.bandwidth_hz * factor) for channel in self.channels)
         return replace(self, channels=tuple(one.model_copy(update={"bandwidth_hz": hz}) for one, hz in corners))
 
-    def first(self, n: int) -> Measured:
+    def select_first(self, n: int) -> Measured:
         """Return the first rows."""
         return self.select_rows(slice(n))
 
@@ -119,7 +119,7 @@ class Measured:
             values[:, c] = CubicSpline(self.times_s, values[:, c])(self.times_s + late_s[self.names[c]])
         return replace(self, values=values)
 
-    def only(self, names: Sequence[str]) -> Measured:
+    def select_channels(self, names: Sequence[str]) -> Measured:
         """Return some of the channels."""
         kept = [c for c, name in enumerate(self.names) if name in names]
         return replace(
@@ -146,7 +146,7 @@ def _range(channel: Channel) -> dict[str, Any]:
     return {"adc_v": reach_v, "range_v": (-reach_v, reach_v)}
 
 
-def measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf) -> dict[str, Measured]:
+def read_measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf) -> dict[str, Measured]:
     """Return the groups of a recording that the model knows, by name.
 
     Args:
@@ -339,7 +339,7 @@ def predict(
     """Simulate an experiment, and return the recorded channels without noise.
 
     Args:
-        experiment: Experiment to simulate; `bare` makes it cheaper.
+        experiment: Experiment to simulate; `simplify` makes it cheaper.
         parts: Channels and rows to predict.
         end_s: Only rows before this time [s].
         follow: Callback for every frame to the end of the experiment; without it the simulation ends after the last
@@ -348,7 +348,7 @@ def predict(
         lead_ins: Cache of lead-ins; only without `follow`.
     """
     if end_s is not None:
-        parts = {name: part.until(end_s) for name, part in parts.items()}
+        parts = {name: part.select_until(end_s) for name, part in parts.items()}
     parts = {name: part for name, part in parts.items() if len(part.times_s)}
     last_s = max((float(part.times_s[-1]) for part in parts.values()), default=0.0)
     simulation = experiment.simulation()
@@ -356,7 +356,7 @@ def predict(
         if follow is not None:
             for frame in experiment.frames(simulation):
                 follow(frame)
-        return Prediction({name: _generated(experiment.scene, part) for name, part in parts.items()}, {}, 1)
+        return Prediction({name: _test_signals(experiment.scene, part) for name, part in parts.items()}, {}, 1)
     row_rate_hz = TICK_RATE_HZ // simulation.row_ticks
     taking = _channels(parts, experiment.scene, row_rate_hz=row_rate_hz)
     chunk_s = min(_CHUNK_S, last_s + 2e-3)  # includes the row of the last sample and some after it
@@ -389,7 +389,7 @@ def predict(
     )
 
 
-def _generated(scene: Scene, part: Measured) -> np.ndarray:
+def _test_signals(scene: Scene, part: Measured) -> np.ndarray:
     """Return a group's test signals in its channels' units, shape (rows, channels)."""
     sources = scene.sources()
     volts = [sources[channel.name].volts(part.times_s).clip(-channel.adc_v, channel.adc_v) for channel in part.channels]
@@ -408,13 +408,13 @@ def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chun
     return max(0, math.floor(first_s / chunk_s)) * chunk * (TICK_RATE_HZ // row_rate_hz)
 
 
-def bare(experiment: Experiment) -> Experiment:
+def simplify(experiment: Experiment) -> Experiment:
     """Return the experiment with one cheap, fault-free sensor group and no companion, at the same row spacing."""
     if experiment.scene.generator is not None:
         return experiment
     groups = (experiment.scene.channels or rig_table()).groups.values()
     fewest = min(groups, key=lambda group: len(group.channels))
-    return experiment.without_faults().changed(
+    return experiment.without_faults().with_changes(
         {
             "engine.companion": False,
             "engine.limits": {},

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import LeadIns, Measured, Prediction, bare, predict
+from replays.recordings.resimulation.prediction import LeadIns, Measured, Prediction, predict, simplify
 from rig.base.errors import InputError, SimulationError
 from rig.channels.sampling import ROW_TICKS
 from rig.physics.model import build_model
@@ -70,7 +70,7 @@ class Derivatives:
     smooth: np.ndarray
 
 
-def value_of(experiment: Experiment, key: str) -> float:
+def get_value(experiment: Experiment, key: str) -> float:
     """Return the number of a key in its own unit; for a rule, its result.
 
     Raises:
@@ -79,7 +79,7 @@ def value_of(experiment: Experiment, key: str) -> float:
     if key in CLOCK or key == ANGLE:
         return 0.0
     if key in STATE:
-        return float(getattr(_begin_of(experiment, key), key.split(".")[1])) / STATE[key][1]
+        return float(getattr(_get_begin(experiment, key), key.split(".")[1])) / STATE[key][1]
     match = _COMMAND_KEY.fullmatch(key)
     if match is not None:
         command = _commands(experiment)[_place(experiment, key)]
@@ -94,7 +94,7 @@ def value_of(experiment: Experiment, key: str) -> float:
         raise InputError(key, f"a number of the command {match[1]}", field)
     if key in load_parameters().entries:
         value = experiment.scene.load_parameters().entries[key].value
-        return _resolved(experiment.scene)[key] if isinstance(value, str) else float(value)
+        return _resolve(experiment.scene)[key] if isinstance(value, str) else float(value)
     value: Any = experiment.scene
     for part in key.split("."):
         value = getattr(value, part, None)
@@ -112,11 +112,11 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
     """
     placed: dict[str, Any] = {key.split(".")[1]: value * STATE[key][1] for key, value in values.items() if key in STATE}
     if placed:
-        begin = _begin_of(experiment, next(key for key in values if key in STATE))
+        begin = _get_begin(experiment, next(key for key in values if key in STATE))
         experiment = replace(experiment, begin=begin._replace(**placed))
     values = {key: value for key, value in values.items() if key not in CLOCK and key not in STATE}
     if ANGLE in values:
-        phase = value_of(experiment, "shaft.unbalance_phase") + values.pop(ANGLE)
+        phase = get_value(experiment, "shaft.unbalance_phase") + values.pop(ANGLE)
         if experiment.begin is None:
             ahead = values.get("drive.speed_hz", experiment.scene.drive.speed_hz) - experiment.scene.drive.speed_hz
             phase -= 2.0 * math.pi * ahead * experiment.first_s
@@ -149,23 +149,23 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
     return replace(changed, scene=parse_scene(data), commands=left)
 
 
-def _begin_of(experiment: Experiment, key: str) -> MotionStart:
+def _get_begin(experiment: Experiment, key: str) -> MotionStart:
     if experiment.begin is None:
         raise InputError(key, "used with a log of a rig that was already running", key)
     return experiment.begin
 
 
-def scale_of(experiment: Experiment, key: str) -> float:
+def get_scale(experiment: Experiment, key: str) -> float:
     """Return the size of a unit change of a value, in its unit: the value itself, or a related length or time."""
     if key in ("ring.offset_x", "ring.offset_y"):
-        return value_of(experiment, "ring.clearance")
+        return get_value(experiment, "ring.clearance")
     if key in ("shaft.unbalance_phase", ANGLE):
         return 1.0
     if key in CLOCK:
         return CLOCK[key][1]
     if key in STATE:
         return STATE[key][2]
-    value = abs(value_of(experiment, key))
+    value = abs(get_value(experiment, key))
     return _SCALES.get(key.split(".")[-1], value if value > 0.0 else 1.0)
 
 
@@ -190,13 +190,13 @@ class Predictor:
     ) -> None:
         self.keys = tuple(keys)
         self.parts = dict(parts)
-        self.start = np.array([value_of(experiment, key) for key in self.keys])
-        self.scales = np.array([scale_of(experiment, key) for key in self.keys])
+        self.start = np.array([get_value(experiment, key) for key in self.keys])
+        self.scales = np.array([get_scale(experiment, key) for key in self.keys])
         self.runs = 0
         first_s = min(float(part.times_s[0]) for part in self.parts.values())
         self._about_s = first_s if about_s is None else about_s
         self._last_s = max(float(part.times_s[-1]) for part in self.parts.values())
-        self._experiment = bare(experiment)
+        self._experiment = simplify(experiment)
         self._cache: dict[tuple[float, ...], Prediction] = {}
         self._lead_ins = LeadIns()
 
@@ -214,7 +214,7 @@ class Predictor:
             if key.endswith(".at_s") and not self._is_later(key):
                 below = math.floor(value / _TICK_S + 1e-3)
                 if value - below * _TICK_S > 1e-3 * _TICK_S:
-                    return self._between(values, place, below)
+                    return self._interpolate_command(values, place, below)
         if values not in self._cache:
             if len(self._cache) > _MAX_CACHED:
                 self._cache.pop(next(iter(self._cache)))
@@ -235,7 +235,7 @@ class Predictor:
         smooth = np.zeros(len(self.keys), dtype=bool)
         directions = [self._direction(values, place) for place in range(len(self.keys))]
         for place, (key, direction) in enumerate(zip(self.keys, directions, strict=True)):
-            grid, scale = _step_of(key), self.scales[place]
+            grid, scale = _get_step(key), self.scales[place]
             slope: dict[str, np.ndarray] = {}
             for step in _shorten(grid or _STEP * scale, grid or _MIN_STEP * scale):
                 slope, smooth[place] = self._quotient(values, place, step * direction, base)
@@ -266,9 +266,9 @@ class Predictor:
     def _is_later(self, key: str) -> bool:
         """Return whether a command comes after the last row, without effect on the samples."""
         kind, number, _ = key.split(".")
-        return value_of(self._experiment, f"{kind}.{number}.at_s") > self._last_s + _MARGIN_S
+        return get_value(self._experiment, f"{kind}.{number}.at_s") > self._last_s + _MARGIN_S
 
-    def _between(self, values: tuple[float, ...], place: int, below: int) -> Prediction:
+    def _interpolate_command(self, values: tuple[float, ...], place: int, below: int) -> Prediction:
         """Return the channels for a command between two ticks."""
         # Rounded, so that the cache is hit.
         ends = [round((below + node) * _TICK_S, 9) for node in (0, 1)]
@@ -320,7 +320,7 @@ def to_model_clock(
     return {name: part.correct_clock(shift, rate, about_s=about_s) for name, part in parts.items()}
 
 
-def _step_of(key: str) -> float | None:
+def _get_step(key: str) -> float | None:
     return _STEPS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
 
 
@@ -355,10 +355,10 @@ def _place(experiment: Experiment, key: str) -> int:
 
 
 @cache
-def _resolved_by(scene: str) -> dict[str, float]:
+def _resolve_text(scene: str) -> dict[str, float]:
     whole = Scene.model_validate_json(scene)
     return build_model(whole.load_parameters(), whole.model).resolved
 
 
-def _resolved(scene: Scene) -> dict[str, float]:
-    return _resolved_by(scene.model_dump_json())
+def _resolve(scene: Scene) -> dict[str, float]:
+    return _resolve_text(scene.model_dump_json())

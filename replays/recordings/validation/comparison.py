@@ -16,7 +16,7 @@ from replays.recordings.identification.nuisance import Tuned, tune, window_start
 from replays.recordings.identification.request import first_command_s
 from replays.recordings.parameters import parameter_doubts
 from replays.recordings.resimulation.experiment import Experiment, is_imported
-from replays.recordings.resimulation.prediction import Measured, Prediction, bare, measured, predict
+from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured, simplify
 from replays.recordings.resimulation.sensitivity import with_values
 from replays.recordings.validation.bits import Bits, StreamBits, missing_rows
 from replays.recordings.validation.criteria import Criteria, load_criteria
@@ -67,9 +67,9 @@ def validate(
         InputError: The recording cannot be resimulated, or a change is invalid.
     """
     criteria = load_criteria() if criteria is None else criteria
-    experiment = Experiment.of(recording)
+    experiment = Experiment.from_recording(recording)
     if changes:
-        experiment = experiment.changed(changes)
+        experiment = experiment.with_changes(changes)
     recording = recording.without_faults() if blind else recording.with_true_blocks()
     if blind:
         experiment = experiment.without_faults()
@@ -134,7 +134,7 @@ def validate(
     if late_s:
         step("the same with channels of a kind late together")
         other = _resimulate_log(recording, experiment, criteria, step, late_s=late_s)
-        if other.tuned is not None and other.tuned.better_than(again.tuned):
+        if other.tuned is not None and other.tuned.is_better_than(again.tuned):
             explained = _explain_log(other, from_s=min(firsts), end_s=min(end, other.tuned.end_s), touching=touching)
     named = [one for one in explained.ranked if one.kind == "model" and one.name in explained.best][:_MAX_CHECKED]
     if named and any(one.good is False for one in judged):
@@ -203,14 +203,14 @@ def _resimulate(
         experiment.scene.check_physics()
         return _resimulate_log(recording, experiment, criteria, step)
     rules = criteria.window
-    parts = measured(recording, experiment.scene, longest_s=rules.longest_s)
+    parts = read_measured(recording, experiment.scene, longest_s=rules.longest_s)
     bits = Bits(recording, experiment.simulation().table)
     step("re-simulated, payload by payload")
     # Only the bits of channels with injected faults are compared: the prediction has no faults.
-    sound = {name: [one for one in part.names if one not in experiment.faulty] for name, part in parts.items()}
-    parts = {name: part.only(sound[name]) for name, part in parts.items() if sound[name]} or parts
+    sound = {name: [one for one in part.names if one not in experiment.faulty_channels] for name, part in parts.items()}
+    parts = {name: part.select_channels(sound[name]) for name, part in parts.items() if sound[name]} or parts
     nominal = predict(experiment, parts, follow=bits.follow)
-    quick = bare(experiment)
+    quick = simplify(experiment)
     step("perturbed, to find the predictable part")
     moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
     found = bits.finish()
@@ -240,28 +240,30 @@ def _resimulate_log(
     """Return the re-simulation of a log: unknown numbers are fitted, and their uncertainty is added to the floor."""
     rules = criteria.imported
     tuned = tune(recording, experiment, rules.nuisances, late_s=late_s, progress=lambda text: step(f"log: {text}"))
-    whole, longest_s = measured(recording, tuned.begun.scene), criteria.window.longest_s
-    begin_s = window_start_s(tuned.begun)
-    parts = {name: part.until(float(part.times_s[0]) + longest_s).starting_at(begin_s) for name, part in whole.items()}
+    whole, longest_s = read_measured(recording, tuned.baseline.scene), criteria.window.longest_s
+    begin_s = window_start_s(tuned.baseline)
+    parts = {
+        name: part.select_until(float(part.times_s[0]) + longest_s).select_from(begin_s) for name, part in whole.items()
+    }
     nominal = tuned.predict(parts)
     step("perturbed, and with equally valid models, to find the predictable part")
     generator = np.random.default_rng(0)  # the same in every validation
     others = [tuned.undo_last_growth().predict(parts)]
-    models = [tuned, *(tuned.changed(variant.set) for variant in rules.variants)]
+    models = [tuned, *(tuned.with_changes(variant.set) for variant in rules.variants)]
     others += [model.predict(parts) for model in models[1:]]
     others += [tuned.predict({name: part.with_corner_factor(rules.bandwidth) for name, part in parts.items()})]
     gains = {name: v + rules.calibration * (v - v.mean(axis=0)) for name, v in nominal.values.items()}
     others += [replace(nominal, values=gains)]
-    until_s = first_command_s(tuned.begun) or math.inf
+    until_s = first_command_s(tuned.baseline) or math.inf
     if np.count_nonzero(recording.edges() < until_s) < 2:
         # The phase of the pulses is unknown: a pulse is possible at any time.
         others.insert(1, _replace_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
     drawn = [models[n % len(models)].draw_values(generator) for n in range(criteria.ensemble.members)]
     faults = signal_faults(whole)
-    faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
+    faults += edge_faults(recording.edges(), until_s, tuned.baseline.scene.drive.speed_hz)
     return _Resimulation(
         faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
-        quick=bare(tuned.experiment), criteria=criteria.for_log(),
+        quick=simplify(tuned.experiment), criteria=criteria.for_log(),
         parts=tuned.to_model_clock(parts),
         nominal=nominal, others=tuple(others), bits={}, tuned=tuned,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from replays.estimate.runs import block_means, split_at
+from replays.estimate.runs import block_means, split_at_breaks
 from replays.recordings.resimulation.prediction import Measured
 from rig.channels.orbit import full_spectrum, whirl_frequency
 from rig.channels.orbit import phase as phase_of
@@ -185,7 +185,7 @@ def select_view(
         kept = slice(*np.searchsorted(part.times_s, (phase.from_s, phase.to_s)))
         if kept.stop - kept.start < 2:
             continue
-        begin, end = max(split_at(np.diff(part.index[kept]) != 1), key=lambda pair: pair[1] - pair[0])
+        begin, end = max(split_at_breaks(np.diff(part.index[kept]) != 1), key=lambda pair: pair[1] - pair[0])
         stretch = slice(kept.start + begin, kept.start + end)
         for c, channel in enumerate(part.channels):
             times[channel.name] = part.times_s[stretch]
@@ -271,7 +271,7 @@ def _find_lasting_contact(times: np.ndarray, contact: np.ndarray, angle: np.ndar
         round_ = abs(angle[s + n - 1] - angle[s]) > MIN_WHIRL_TURNS
         kinds.append(("whirl" if round_ else "rest") if held else "")
     labels = np.array(kinds)
-    runs = [run for run in split_at(labels[1:] != labels[:-1]) if kinds and kinds[run[0]]]
+    runs = [run for run in split_at_breaks(labels[1:] != labels[:-1]) if kinds and kinds[run[0]]]
     if not runs:
         return (0.0, 0.0), ""
     first, end = max(runs, key=lambda run: run[1] - run[0])

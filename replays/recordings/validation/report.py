@@ -12,7 +12,7 @@ from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
 from replays.report import OUTCOME_MARKS, Mark, Report, Row
-from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, legend_below, new_figure
+from replays.report.canvas import BLUE, ORANGE, RED, add_legend, axis_label, draw_signals, house_style, new_figure
 from rig.channels.orbit import full_spectrum
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, floa
             _overlay(left, part, values, c, whole)
             _overlay(middle, part, values, c, window)
             _residual(right, part, values, c, window)
-            left.set_ylabel(label_of(channel.name, channel.unit))
+            left.set_ylabel(axis_label(channel.name, channel.unit))
             for axes, (why, begin, end) in zip(row, (whole, window, window), strict=True):
                 if begin < found.window_s[1] < end - 1e-6:
                     axes.axvline(
@@ -254,7 +254,7 @@ def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, floa
                     axes.set_title("Residual" if axes is right else _sentence(why.partition(",")[0]))
                 if c == n - 1:
                     axes.set_xlabel("time [s]")
-    legend_below(figure)
+    add_legend(figure)
     return figure
 
 
@@ -296,5 +296,5 @@ def _orbits(found: Validation, pairs: list[tuple[str, str]]) -> Figure:
             right.semilogy(frequency[shown], np.maximum(amplitude[shown], 1e-6), style, color=colour, lw=1.0)
         left.set(title="Orbit", xlabel=f"{pair[0]} [mm]", ylabel=f"{pair[1]} [mm]", aspect="equal")
         right.set(title="Full spectrum", xlabel="frequency [Hz], negative is backward", ylabel="amplitude [mm]")
-    legend_below(figure, panels[0][0])
+    add_legend(figure, panels[0][0])
     return figure

@@ -10,7 +10,7 @@ import numpy as np
 
 from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict
-from replays.recordings.resimulation.sensitivity import value_of, with_values
+from replays.recordings.resimulation.sensitivity import get_value, with_values
 from replays.recordings.validation.criteria import Criteria
 from replays.recordings.validation.phases import (
     QUANTITIES,
@@ -74,7 +74,7 @@ class StatisticResult:
 
 def perturbed(experiment: Experiment, keys: tuple[str, ...], part: float) -> Experiment:
     """Return the experiment with some values increased by a relative amount."""
-    return with_values(experiment, {key: value_of(experiment, key) * (1.0 + part) for key in keys})
+    return with_values(experiment, {key: get_value(experiment, key) * (1.0 + part) for key in keys})
 
 
 def _whole(parts: dict[str, Measured]) -> Phase:

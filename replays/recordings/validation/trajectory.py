@@ -116,7 +116,7 @@ def residuals(
     """
     found = []
     for name, part in parts.items():
-        n = part.rows_until(end_s)
+        n = part.count_rows(end_s)
         if n == 0:
             continue
         z = scaled(part, nominal.values[name][:n], [other.values[name][:n] for other in others])

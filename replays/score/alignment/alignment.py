@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from replays.score.alignment.begins import EQUAL_BALANCE_PART, MAX_FOLLOWED, Begins, trim_quiet_ends
-from replays.score.alignment.one_begin import MIN_ROWS, Alignment, Source, find_busiest, follow
+from replays.score.alignment.one_begin import MIN_ROWS, Alignment, RowSource, find_busiest, follow
 
 _STRETCHES_S = (0.25, 0.03)
 """Lengths of the first fitted stretch [s]; the second one if clocks differ, or samples are lost, in the first."""
@@ -20,7 +20,7 @@ _EQUAL_LOG_POWER = math.log(2.0)
 """Largest difference in the logarithm of residual power, summed over signals, at which starts count as equal."""
 
 
-def align(sources: Sequence[Source]) -> Alignment | None:
+def align(sources: Sequence[RowSource]) -> Alignment | None:
     """Align the signals of one table with the session; return None if they are not found in it."""
     if not sources or len(sources[0].values) < MIN_ROWS:
         return None
@@ -73,7 +73,7 @@ def align(sources: Sequence[Source]) -> Alignment | None:
     return replace(trim_quiet_ends(best, one), ambiguous=len(alike) > 1, steps_doubted=doubted)
 
 
-def _follow_best(begins: Begins, sources: Sequence[Source]) -> tuple[list[Alignment], list[Alignment]]:
+def _follow_best(begins: Begins, sources: Sequence[RowSource]) -> tuple[list[Alignment], list[Alignment]]:
     """Return the starts that none surpasses by some signals, and the alignments of the first of them by all signals."""
     alike = begins.find_best()
     shifts_s = [each.begin_s for each in alike[:MAX_FOLLOWED]]
@@ -93,7 +93,7 @@ def _contradicts(other: Alignment, found: Alignment) -> bool:
     )
 
 
-def _log_residual_power(found: Alignment, sources: Sequence[Source]) -> float:
+def _log_residual_power(found: Alignment, sources: Sequence[RowSource]) -> float:
     """Return the logarithm of the residual part of each signal's power from a common start, summed over the signals.
 
     Each signal matches a repeated start at a slightly different time, as a keyphasor does whose pulses occur at another

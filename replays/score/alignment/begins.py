@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from replays.score.alignment.one_begin import MIN_LIKENESS, MIN_ROWS, Alignment, Source, find_busiest, follow
+from replays.score.alignment.one_begin import MIN_LIKENESS, MIN_ROWS, Alignment, RowSource, find_busiest, follow
 from replays.score.alignment.repeats import find_repeats
 from replays.score.records.stimulus import Exact
 from replays.score.waveform import Waveform, fit_stretch, fit_waveform
@@ -57,7 +57,7 @@ class Begins:
     """
 
     def __init__(
-        self, one: Source, sources: Sequence[Source], stretches: Callable[[float], Sequence[tuple[int, int]]]
+        self, one: RowSource, sources: Sequence[RowSource], stretches: Callable[[float], Sequence[tuple[int, int]]]
     ) -> None:
         """Select one signal to follow, and for comparison those that correlate least, as they repeat least."""
         others = sorted((each for each in sources if each is not one), key=lambda each: each.wire.likeness)
@@ -90,7 +90,7 @@ class Begins:
                 found[n, part] = max(float(np.var(fit.residual)), 1e-300)
         return found
 
-    def _residual_power(self, found: Alignment, one: Source) -> np.ndarray:
+    def _residual_power(self, found: Alignment, one: RowSource) -> np.ndarray:
         """Return the residual power of blocks over that of noise; their whole power where unexplained, nan outside."""
         values, times_s, curve = found.even(one)
         fit = fit_waveform(values, times_s, one.stimulus, curve)
@@ -188,7 +188,7 @@ class Begins:
             parts.append(alike[0].track.inside)
         return [each for one in self._searched for each in self._find_shifts_in(one, alike[0], parts)]
 
-    def _find_shifts_in(self, one: Source, best: Alignment, parts: Sequence[tuple[int, int]]) -> list[float]:
+    def _find_shifts_in(self, one: RowSource, best: Alignment, parts: Sequence[tuple[int, int]]) -> list[float]:
         """Return the shifts at which a signal matches parts of its record, by the clock of the best start [s]."""
         values, times_s, curve = best.even(one)
         rows, held = np.arange(len(values)), np.isfinite(values)
@@ -280,7 +280,7 @@ def _find_outliers(fit: Waveform) -> np.ndarray:
     return odd if odd.mean() < _MAX_OUTLIER_PART else np.zeros(len(odd), bool)
 
 
-def trim_quiet_ends(found: Alignment, one: Source) -> Alignment:
+def trim_quiet_ends(found: Alignment, one: RowSource) -> Alignment:
     """Return an alignment without quiet rows at the ends of the session, when the DAQ was not connected yet."""
     values, times_s, curve = found.even(one)
     fit = fit_waveform(values, times_s, one.stimulus, curve)

@@ -35,7 +35,7 @@ _MAX_CANDIDATES = 4
 
 
 @dataclass
-class Source:
+class RowSource:
     """A recorded signal, its connection and its known signal.
 
     Attributes:
@@ -100,7 +100,7 @@ class Alignment:
         """Number of explained rows less that of unexplained rows in the session."""
         return 2 * self.track.explained - (self.track.inside[1] - self.track.inside[0])
 
-    def even(self, source: Source) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float]]:
+    def even(self, source: RowSource) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float]]:
         """Return a signal's values at even instants, with nan for unexplained ones.
 
         Returns:
@@ -140,7 +140,7 @@ class Alignment:
         return self.track.explained / max(1, self.track.inside[1] - self.track.inside[0])
 
 
-def find_busiest(sources: Sequence[Source], within: tuple[int, int], length: int) -> tuple[int, int]:
+def find_busiest(sources: Sequence[RowSource], within: tuple[int, int], length: int) -> tuple[int, int]:
     """Return the stretch of a table in which its signals change most."""
     first, last = within
     length = min(last - first, max(MIN_ROWS, length))
@@ -153,7 +153,7 @@ def find_busiest(sources: Sequence[Source], within: tuple[int, int], length: int
     return begin, begin + length
 
 
-def _fit_stretches(sources: Sequence[Source], shift_s: float, stretch: tuple[int, int]) -> dict[str, Waveform]:
+def _fit_stretches(sources: Sequence[RowSource], shift_s: float, stretch: tuple[int, int]) -> dict[str, Waveform]:
     """Return the fits of a stretch from one start, of the signals that are found in it."""
     found = {}
     for one in sources:
@@ -163,7 +163,7 @@ def _fit_stretches(sources: Sequence[Source], shift_s: float, stretch: tuple[int
     return found
 
 
-def _refine_begin_s(one: Source, shift_s: float, stretch: tuple[int, int]) -> float:
+def _refine_begin_s(one: RowSource, shift_s: float, stretch: tuple[int, int]) -> float:
     """Return the start near a given one from which a stretch has the least residual [s]."""
     y, period_s = np.nan_to_num(one.values[slice(*stretch)]), 1.0 / one.rate_hz
     reach, n = math.ceil(_SEARCH_RANGE_S * one.rate_hz * _OVERSAMPLING), len(y)
@@ -183,7 +183,7 @@ def _refine_begin_s(one: Source, shift_s: float, stretch: tuple[int, int]) -> fl
     return float(shifts[int(np.argmin(left))])
 
 
-def follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple[int, int]]) -> Alignment | None:
+def follow(sources: Sequence[RowSource], shift_s: float, stretches: Sequence[tuple[int, int]]) -> Alignment | None:
     """Return the alignment of a record from one start, or None.
 
     Args:

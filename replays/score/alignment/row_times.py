@@ -72,7 +72,7 @@ class Follower:
 
 
 @dataclass(frozen=True)
-class Run:
+class RowRun:
     """Consecutive rows that the known signal explains, without a step.
 
     Attributes:
@@ -97,7 +97,7 @@ class Track:
         inside: First row in the session, and the row after the last.
     """
 
-    runs: list[Run]
+    runs: list[RowRun]
     blocks: np.ndarray
     inside: tuple[int, int]
 
@@ -158,7 +158,7 @@ class _Walk:
 
     def __init__(self, followers: Sequence[Follower], first_s: float, period_s: float, rows: int) -> None:
         self._followers, self._first_s, self._period_s, self._rows = followers, first_s, period_s, rows
-        self.runs: list[Run] = []
+        self.runs: list[RowRun] = []
         self.blocks: list[tuple[float, float]] = []
         self.end = 0
         self._need = _RESOLUTION**-2.0
@@ -271,7 +271,7 @@ class _Walk:
 
     def _add_run(self, begin: int, end: int, lag: int, doubt: tuple[int, int]) -> None:
         if end > begin:
-            self.runs.append(Run(begin, end, lag, doubt))
+            self.runs.append(RowRun(begin, end, lag, doubt))
 
     def _find(self, y: np.ndarray, s: np.ndarray, ds: np.ndarray, edges: list[int], row: int) -> tuple[int, int] | None:
         """Return a step that explains the next block, this one, or the second next one: samples, and a row after it."""
@@ -476,10 +476,10 @@ def follow_record(
     back.follow(rows - middle, 0.0, pace)
     doubts = [*(run.doubt for run in back.runs), (rows - middle, rows - middle)]
     runs = [
-        Run(rows - run.end, rows - run.begin, -run.lag, (rows - doubt[1], rows - doubt[0]))
+        RowRun(rows - run.end, rows - run.begin, -run.lag, (rows - doubt[1], rows - doubt[0]))
         for run, doubt in zip(back.runs, doubts[1:], strict=True)
     ][::-1]
-    merged: list[Run] = []
+    merged: list[RowRun] = []
     for run in [*runs, *onward.runs]:
         if merged and (merged[-1].end, merged[-1].lag) == (run.begin, run.lag):
             merged[-1] = replace(merged[-1], end=run.end)

@@ -9,7 +9,7 @@ import numpy as np
 from replays.estimate.clock import fit_line
 from replays.estimate.intervals import chi2_mean_ends, make_interval, student
 from replays.score.card.scorecard import Interval
-from replays.score.records.recorded import Table
+from replays.score.records.recorded import RecordedTable
 
 _MAX_BATCHES, _JUDGED_BATCHES = 256, 32
 """Batches of stamps in the picture, and in the intervals."""
@@ -26,7 +26,7 @@ class Stamps:
         times_s: Stamps of the next rows [s], shape (n,).
     """
 
-    def __init__(self, table: Table, *, shown: bool = False) -> None:
+    def __init__(self, table: RecordedTable, *, shown: bool = False) -> None:
         """Prepare batches of a table's stamps, or of stamps from elsewhere if `shown`."""
         self.times_s = np.empty(0)
         self._stamped, self._size = shown or table.stamped, max(4, min(table.rows // _MAX_BATCHES, _MAX_BATCH_ROWS))

@@ -62,7 +62,7 @@ class Limit(BaseModel):
         return ", ".join(part for part in (*parts, "assumed" if self.kind == "assumed" else "") if part)
 
 
-class Limits(BaseModel):
+class ScoreLimits(BaseModel):
     """A set of limits by quantity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -126,7 +126,7 @@ def _read_property(channel: Channel, what: Property, amplitude: float) -> float:
     }[what]
 
 
-def load_limits(given: Path | str | None = None) -> Limits:
+def load_limits(given: Path | str | None = None) -> ScoreLimits:
     """Load limits: a set of the rig's by its name, or a file.
 
     Raises:
@@ -138,7 +138,7 @@ def load_limits(given: Path | str | None = None) -> Limits:
         if str(path) not in shipped:
             raise UnknownNameError("limits", "a .toml file or a set of the rig's", str(path), sorted(shipped))
         path = shipped[str(path)]
-    limits = check(Limits, read_toml(path), field=path.name)
+    limits = check(ScoreLimits, read_toml(path), field=path.name)
     for name, known in (("digital", DIGITAL), ("analogue", ANALOGUE)):
         for quantity, limit in getattr(limits, name).items():
             if quantity not in known:

@@ -368,20 +368,20 @@ def write_junit(card: Scorecard, path: Path) -> None:
     junit.write_junit(path, [junit.Suite(f"rig score, {card.path}", cases, others)])
 
 
-def _outcome_case(card: Scorecard) -> junit.Case:
+def _outcome_case(card: Scorecard) -> junit.JunitCase:
     result: dict[Outcome, junit.Outcome] = {
         Outcome.PASS: "passed", Outcome.FAIL: "failure", Outcome.INCONCLUSIVE: "inconclusive",
     }  # fmt: skip
     lines = "\n".join(card.doubts)
-    return junit.Case(f"score.{card.path}", "outcome", result[card.outcome], card.verdict_line, lines)
+    return junit.JunitCase(f"score.{card.path}", "outcome", result[card.outcome], card.verdict_line, lines)
 
 
-def _case(card: Scorecard, row: ScoreRow) -> junit.Case:
+def _case(card: Scorecard, row: ScoreRow) -> junit.JunitCase:
     classname, name, line = f"score.{card.path}", f"{row.quantity} {row.channel}".strip(), _line(row)
     if row.verdict == PASS:
-        return junit.Case(classname, name, text=line)
+        return junit.JunitCase(classname, name, text=line)
     source = "" if row.limit is None else row.limit.source
-    return junit.Case(classname, name, "failure", line, f"{line}\nsource: {source}\n{row.note}")
+    return junit.JunitCase(classname, name, "failure", line, f"{line}\nsource: {source}\n{row.note}")
 
 
 def _line(row: ScoreRow) -> str:

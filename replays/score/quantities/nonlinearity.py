@@ -12,8 +12,8 @@ import numpy as np
 
 from replays.estimate.clock import fit_line
 from replays.estimate.intervals import bound_maximum
-from replays.estimate.least_squares import inverse_of, solve
-from replays.estimate.runs import block_means, split_at
+from replays.estimate.least_squares import compute_inverse, solve
+from replays.estimate.runs import block_means, split_at_breaks
 from replays.estimate.sine import decibels, fit_sine, fit_tones, tone_columns
 from replays.score.card.scorecard import Interval
 
@@ -115,7 +115,7 @@ class Transfer:
 def _fit_ramp(times_s: np.ndarray, known: np.ndarray, span: float) -> np.ndarray | None:
     """Return the lines of a ramp through the known signal, nan next to its jumps, shape (n,); or None."""
     ramp = np.full(len(known), np.nan)
-    for a, b in split_at(np.abs(np.diff(known)) > _JUMP * span):
+    for a, b in split_at_breaks(np.abs(np.diff(known)) > _JUMP * span):
         if b - a > _SEGMENT_ROWS + 2 * _RING_ROWS:
             part = slice(a + _RING_ROWS, b - _RING_ROWS)
             line = fit_line(times_s[part], known[part])
@@ -155,7 +155,7 @@ def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, s
     part, row = place - knot, np.arange(len(x))
     entries = np.concatenate([1.0 - part, part]), (np.tile(row, 2), np.concatenate([knot, knot + 1]))
     hats = csr_array(entries, shape=(len(x), _KNOTS + 1))
-    inverse = inverse_of((hats.T @ hats).toarray())
+    inverse = compute_inverse((hats.T @ hats).toarray())
     curve = inverse @ (hats.T @ line.residual)
     left = line.residual - hats @ curve
     block = max(1, len(x) // (8 * _KNOTS))  # coloured noise has block means with a larger variance

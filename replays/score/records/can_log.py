@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from replays.score.records.recorded import Pieces, Recorded, Table
+from replays.score.records.recorded import Pieces, Recorded, RecordedTable
 from rig.base.checks import build_read_error
 from rig.base.errors import InputError, Words
 from rig.channels.table import ChannelTable
@@ -72,7 +72,7 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
         values = np.concatenate([part.values for part in parts])
         times_s = np.repeat(stamps, form.rows)
         # Stamps are those of frames, and show when these arrived, not the sampling rate.
-        whole = Table(len(values), values.shape[1], _read_pieces(values, times_s))
+        whole = RecordedTable(len(values), values.shape[1], _read_pieces(values, times_s))
         for column, (channel, bits) in enumerate(zip(form.channels, form.shifts.tolist(), strict=True)):
             if not np.isnan(values[:, column]).all():
                 found.append(Recorded(channel.name, channel.unit, whole, column, rates["rate"] / step, bits))

@@ -37,7 +37,7 @@ are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak an
 Pieces = Callable[[Sequence[int]], Iterable[np.ndarray]]
 
 
-class Table:
+class RecordedTable:
     """Signals of a file with common time stamps.
 
     Attributes:
@@ -73,7 +73,7 @@ class Table:
         """Return stamps and all columns of some rows, as far as there are any, shape (n, 1 + columns)."""
         return take_rows(self.parts(range(self._columns)), row, rows, 1 + self._columns)
 
-    def changed(self, by_column: Mapping[int, tuple[float, float]]) -> Table:
+    def changed(self, by_column: Mapping[int, tuple[float, float]]) -> RecordedTable:
         """Return a table whose values are size * (value - bias), by the column's size and bias."""
 
         def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
@@ -81,9 +81,9 @@ class Table:
             for piece in self._pieces(columns):
                 yield np.column_stack([piece[:, :1], sizes * (piece[:, 1:] - biases)])
 
-        return Table(self.rows, self._columns, pieces)
+        return RecordedTable(self.rows, self._columns, pieces)
 
-    def select_rows(self, column: int, step: int, first: int) -> Table:
+    def select_rows(self, column: int, step: int, first: int) -> RecordedTable:
         """Return a table of every `step`-th row from a row, or for step 1 of the rows with a value in a column."""
 
         def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
@@ -94,7 +94,7 @@ class Table:
                 yield np.delete(part[rows % step == first if step > 1 else np.isfinite(part[:, 1])], 1, axis=1)
 
         rows = len(range(first, self.rows, step)) if step > 1 else sum(map(len, pieces([])))
-        return Table(rows, self._columns, pieces)
+        return RecordedTable(rows, self._columns, pieces)
 
     @property
     def stamped(self) -> bool:
@@ -147,7 +147,7 @@ class Recorded:
 
     name: str
     unit: str
-    table: Table
+    table: RecordedTable
     column: int
     stated_hz: float | None
     lost_bits: int = 0
@@ -204,7 +204,7 @@ def open_recorded(path: Path, options: FileOptions | None = None, remarks: list[
         source = replace(source, entries=tuple(replace(each, rows=each.rows - 1) for each in source.entries))
     for entry in source.entries:
         tables.setdefault((entry.group, entry.rows), []).append(entry)
-    known = {key: Table(key[1], len(entries), _read_source(source, entries)) for key, entries in tables.items()}
+    known = {key: RecordedTable(key[1], len(entries), _read_source(source, entries)) for key, entries in tables.items()}
     return [
         Recorded(
             entry.name, units.canonical(entry.unit), known[key := (entry.group, entry.rows)],
@@ -269,7 +269,7 @@ def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded
         signals: Signals of a file.
         rate_hz: Row rate of a table that gives none [Hz].
     """
-    tables, found = dict[tuple[int, int, int, bytes], Table](), list[Recorded]()
+    tables, found = dict[tuple[int, int, int, bytes], RecordedTable](), list[Recorded]()
     for signal in signals:
         rows, step = np.flatnonzero(np.isfinite(signal.early)), 1
         if len(rows) > 2 and (rows[-1] - rows[0]) >= len(rows):
@@ -346,7 +346,7 @@ def _open_recording(path: Path) -> list[Recorded]:
         stream = recording.streams.get(sensor_key(group.name))
         if stream is not None and stream.rows:
             rate_hz = next(recording.blocks(sensor_key(group.name))).rate_hz
-            table = Table(stream.rows, len(group.channels), _read_recording(recording, group))
+            table = RecordedTable(stream.rows, len(group.channels), _read_recording(recording, group))
             found += [Recorded(each.name, each.unit, table, n, rate_hz) for n, each in enumerate(group.channels)]
     if not found:
         raise InputError("FILE", "a recording with samples", str(path))

@@ -15,7 +15,7 @@ from recorder.reader import join
 from replays.score.records.rows import take_rows
 from rig.base.errors import InputError, Words
 from rig.base.wire import sensor_key
-from rig.channels.generators import Source
+from rig.channels.generators import VoltageSource
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import Channel
 from rig.run.commands.table import TRIGGERS
@@ -161,7 +161,7 @@ class Session:
         return len(part) > 1 and float(np.std(part)) > least
 
 
-def _formula(source: Source) -> Formula:
+def _formula(source: VoltageSource) -> Formula:
     channel = source.channel
 
     def value(times_s: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.estimate.runs import true_runs
+from replays.estimate.runs import find_true_runs
 from replays.estimate.spectra import correlation, spectrum
 
 _LIMIT, _CHANCE = 0.2, 6.0
@@ -277,7 +277,7 @@ def _find_common_lags(curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], z
         return [zero]
     curve = np.mean(clear, axis=0)
     high = curve >= _EQUAL_PART * curve.max()
-    peaks = [low + int(np.argmax(curve[low:up])) for low, up in true_runs(high)]
+    peaks = [low + int(np.argmax(curve[low:up])) for low, up in find_true_runs(high)]
 
     def rank(at: int) -> tuple[int, int, bool, int]:
         named = sum(bool(own[at] >= _CLEAR_PART * alike[at]) for alike, own, _ in curves)

@@ -46,7 +46,7 @@ _RUB_BUDGET_S = {"quick": 4.0, "full": 120.0}
 
 
 @dataclass
-class Progress:
+class ChartProgress:
     """Receiver of progress reports, displayed by the command line."""
 
     begin: Callable[[int], None] = lambda _total: None
@@ -54,7 +54,7 @@ class Progress:
 
 
 @dataclass
-class Outcome:
+class ChartOutcome:
     """Result of a chart run."""
 
     files: list[Path] = field(default_factory=list)
@@ -80,8 +80,8 @@ def make_chart(
     end_s: float | None = None,
     methods: list[str] | None = None,
     command: str = "rig chart",
-    progress: Progress | None = None,
-) -> Outcome:
+    progress: ChartProgress | None = None,
+) -> ChartOutcome:
     """Measure missing points and draw the chart.
 
     Args:
@@ -100,12 +100,12 @@ def make_chart(
         InputError: If a choice is invalid, or the folder cannot be written.
     """
     chosen, only = select(only, panels)
-    progress = progress or Progress()
+    progress = progress or ChartProgress()
     store = Store(folder, fresh=fresh)
     contenders = competitors(peers=peers)
     if methods is not None:
         contenders = {name: contenders[name] for name in methods}
-    outcome = Outcome(outdated=store.outdated, missing=missing_peers() if peers else [])
+    outcome = ChartOutcome(outdated=store.outdated, missing=missing_peers() if peers else [])
     work = _Work(store, contenders, mode, end_s)
     try:
         _measure(work, chosen, only, outcome, progress)
@@ -127,7 +127,7 @@ def make_chart(
     return outcome
 
 
-def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | None = None) -> Outcome:
+def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | None = None) -> ChartOutcome:
     """Draw the table of an earlier chart again without measuring.
 
     Raises:
@@ -140,10 +140,10 @@ def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | Non
     if not rows:
         raise InputError("output", "a folder with points in chart.csv", str(folder))
     files = draw(rows, folder, chosen, command=_command(rows[0]["mode"]))
-    return Outcome(files=files, resumed=len(rows), failures=sum(bool(row["failure"]) for row in rows))
+    return ChartOutcome(files=files, resumed=len(rows), failures=sum(bool(row["failure"]) for row in rows))
 
 
-def add_solvers(folder: Path, paths: list[Path], *, progress: Progress | None = None) -> Outcome:
+def add_solvers(folder: Path, paths: list[Path], *, progress: ChartProgress | None = None) -> ChartOutcome:
     """Add solvers outside the project to a chart by their results, and draw it without measuring other points.
 
     Args:
@@ -157,7 +157,7 @@ def add_solvers(folder: Path, paths: list[Path], *, progress: Progress | None = 
     """
     from replays.studies.chart.drawing.figure import draw
 
-    progress = progress or Progress()
+    progress = progress or ChartProgress()
     added = [read_submission(path) for path in paths]
     charted = read_table(folder) if (folder / "chart.csv").exists() else []
     store = Store(folder)
@@ -177,7 +177,7 @@ def add_solvers(folder: Path, paths: list[Path], *, progress: Progress | None = 
         work.keep({**base, "friction": "exact"}, each.point(reference))
     rows = store.rows(mode)
     files = store.write(mode) + draw(rows, folder, list(PANELS), command=_command(mode))
-    return Outcome(files=files, measured=len(added), failures=sum(bool(row["failure"]) for row in rows))
+    return ChartOutcome(files=files, measured=len(added), failures=sum(bool(row["failure"]) for row in rows))
 
 
 def _command(mode: str) -> str:
@@ -259,7 +259,7 @@ class _Work:
         }
 
 
-def _measure(work: _Work, panels: list[str], only: str | None, outcome: Outcome, progress: Progress) -> None:
+def _measure(work: _Work, panels: list[str], only: str | None, outcome: ChartOutcome, progress: ChartProgress) -> None:
     tasks = plan_points(work.contenders, mode=work.mode, panels=panels, only=only)
     walks = {} if only else {panel: len(walk[0]) for panel, walk in _walks(work).items() if panel in panels}
     windows = {(task.panel, task.phase, task.case) for task in tasks if task.panel != RUB}
@@ -309,7 +309,7 @@ def _references(work: _Work, panel: str, phase: str, case: str) -> None:
     work.store.add(own | columns)
 
 
-def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadline: float) -> None:
+def _point(work: _Work, task: Task, outcome: ChartOutcome, progress: ChartProgress, deadline: float) -> None:
     contender = work.contenders[task.method]
     progress.step(f"{task.panel}, {task.phase}: {contender.title}, {task.setting.label}")
     row = work.base(task.panel, task.phase, task.case, contender, task.setting)
@@ -344,7 +344,7 @@ def _walks(work: _Work) -> dict[str, tuple[dict[str, Callable[[], Problem]], tup
     return {"profile": (draws, (profile.TARGET,)), "scenes": (scenes, SCENE_TARGETS)}
 
 
-def _walk_ladders(work: _Work, panel: str, outcome: Outcome, progress: Progress, deadline: float) -> None:
+def _walk_ladders(work: _Work, panel: str, outcome: ChartOutcome, progress: ChartProgress, deadline: float) -> None:
     problems, targets = _walks(work)[panel]
     rivals = [one for one in work.contenders.values() if not one.known_failure]
     if panel == "profile":

@@ -10,11 +10,7 @@ import math
 from typing import NamedTuple
 
 from replays.report.canvas import BLUE, GREEN, ORANGE, PINK, RED, SKY
-from replays.studies.common.closed_forms import (
-    RUNGE_KUTTA_4_LIMIT,
-    RUNGE_KUTTA_4_REAL_LIMIT,
-    VERLET_LIMIT,
-)
+from replays.studies.common.closed_forms import RUNGE_KUTTA_4_LIMIT, RUNGE_KUTTA_4_REAL_LIMIT, VERLET_LIMIT
 from rig.physics.engines import ENGINES
 
 Steps = tuple[tuple[int, float], ...]
@@ -23,7 +19,7 @@ FIXED_STEPS = (50, 40, 25, 20, 10, 5, 2)
 """Steps at which a fixed-step engine is charted [µs]."""
 
 
-def _fixed(*steps_us: int) -> Steps:
+def _fixed_steps(*steps_us: int) -> Steps:
     return tuple((step, 0.0) for step in steps_us)
 
 
@@ -79,16 +75,16 @@ _ROWS = {
         oscillator_limit=math.inf, coarse_bounce=_SHORTENS,
     ),
     "rk4": Traits(
-        GREEN, "^", _fixed(*FIXED_STEPS), _fixed(50, 20, 10, 5),
+        GREEN, "^", _fixed_steps(*FIXED_STEPS), _fixed_steps(50, 20, 10, 5),
         oscillator_limit=RUNGE_KUTTA_4_LIMIT, damping_limit=RUNGE_KUTTA_4_REAL_LIMIT, on_real_axis=True,
         coarse_bounce=(False, f"{_FEW_STEPS}0.5"),
     ),
     "verlet": Traits(
-        ORANGE, "v", quick=_fixed(50, 10, 5),
+        ORANGE, "v", quick=_fixed_steps(50, 10, 5),
         oscillator_limit=VERLET_LIMIT, damping_limit=2.0, allowance=20.0, coarse_bounce=(False, f"{_FEW_STEPS}35"),
     ),
     "semi-implicit-euler": Traits(
-        "#4000b0", "<", quick=_fixed(50, 10, 5),
+        "#4000b0", "<", quick=_fixed_steps(50, 10, 5),
         oscillator_limit=VERLET_LIMIT, damping_limit=2.0, allowance=100.0, coarse_bounce=(False, f"{_FEW_STEPS}1"),
     ),
     "rosenbrock": Traits(PINK, "P", oscillator_limit=math.inf, coarse_bounce=_SHORTENS),
@@ -106,7 +102,7 @@ def settings(engine: str, *, quick: bool) -> Steps:
     if method.tolerance:
         about = tuple((method.step_us, method.tolerance * 10.0**n) for n in (3, 2, 1, 0, -1, -2))
     else:
-        about = _fixed(*FIXED_STEPS)
+        about = _fixed_steps(*FIXED_STEPS)
     full = own.settings or about
     return own.quick or full[1::2] if quick else full
 
@@ -116,6 +112,6 @@ def is_adaptive(engine: str) -> bool:
     return ENGINES[engine].tolerance > 0.0
 
 
-def friction_of(engine: str) -> str:
+def supported_friction(engine: str) -> str:
     """Return the most exact friction law that an engine supports."""
     return next(law for law in ("exact", "smoothed", "switch", "none") if law in ENGINES[engine].frictions)

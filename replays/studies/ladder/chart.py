@@ -11,7 +11,7 @@ from replays.report.canvas import BLACK, house_style, new_figure, save
 from replays.studies.common.engines import traits
 from replays.studies.ladder.document import python_line
 from replays.studies.ladder.quantity import QUANTITIES
-from replays.studies.ladder.search import Ladder, Step
+from replays.studies.ladder.search import Ladder, Rung
 
 _MAX_QUANTITIES = 3
 """Number of quantities drawn; the document contains all."""
@@ -45,18 +45,18 @@ def draw(ladder: Ladder, folder: Path) -> list[Path]:
 def _range(ladder: Ladder, name: str) -> tuple[float, float]:
     """Return the range of errors drawn; smaller ones are drawn at the left edge, infinite ones at the right."""
     own, tolerance = ladder.reference_errors[name], ladder.tolerances[name]
-    seen = [
+    visible = [
         value
         for step in ladder.steps
         for errors in (step.errors.model, step.errors.numerical, step.errors.total)
         for key, value in errors.items()
         if key == name and math.isfinite(value) and value > 0.0
     ]
-    low = max(min([own, *seen, tolerance]), 1e-10)
-    return 10.0 ** math.floor(math.log10(low)) / 2.0, 10.0 ** math.ceil(math.log10(max([1.0, *seen]))) * 30.0
+    low = max(min([own, *visible, tolerance]), 1e-10)
+    return 10.0 ** math.floor(math.log10(low)) / 2.0, 10.0 ** math.ceil(math.log10(max([1.0, *visible]))) * 30.0
 
 
-def _dress(axes: Any, ladder: Ladder, name: str) -> tuple[float, float]:
+def _style_axes(axes: Any, ladder: Ladder, name: str) -> tuple[float, float]:
     low, high = _range(ladder, name)
     tolerance = ladder.tolerances[name]
     axes.set_xscale("log")
@@ -71,12 +71,12 @@ def _dress(axes: Any, ladder: Ladder, name: str) -> tuple[float, float]:
     return low, high
 
 
-def _placed(value: float, low: float, high: float) -> float:
+def _clip_value(value: float, low: float, high: float) -> float:
     return min(max(value, low * 1.3), high / 8.5) if math.isfinite(value) else high / 2.8
 
 
-def _draw_levels(axes: Any, ladder: Ladder, levels: list[Step], name: str, *, named: bool) -> None:
-    low, high = _dress(axes, ladder, name)
+def _draw_levels(axes: Any, ladder: Ladder, levels: list[Rung], name: str, *, named: bool) -> None:
+    low, high = _style_axes(axes, ladder, name)
     reference = ladder.reference.values[name]
     unit = f" {QUANTITIES[name].unit}" if QUANTITIES[name].unit else ""
     shown = reference if isinstance(reference, str) else f"{reference:.6g}{unit}"
@@ -86,7 +86,7 @@ def _draw_levels(axes: Any, ladder: Ladder, levels: list[Step], name: str, *, na
             axes.annotate(f"reference {shown}", (low, row), xytext=(6, 0), textcoords="offset points", va="center")
             continue
         good = error <= ladder.tolerances[name] - ladder.reference_errors[name]
-        place = _placed(error, low, high)
+        place = _clip_value(error, low, high)
         axes.plot([low, place], [row, row], color="0.75", lw=1.2, zorder=2)
         marker, colour = ("o", _GOOD) if good else ("X", _BAD)
         axes.plot(place, row, marker=marker, ms=8, color=colour, mec="white", ls="none", zorder=3)
@@ -103,13 +103,13 @@ def _draw_levels(axes: Any, ladder: Ladder, levels: list[Step], name: str, *, na
     axes.set_title(f"{name.replace('_', ' ').capitalize()}:\nmodel error of each level")
 
 
-def _row_label(step: Step) -> str:
+def _row_label(step: Rung) -> str:
     if step.stage == "together":
         return "all that pass, together"
     return f"{step.label} *" if step.note else step.label
 
 
-def _draw_work(axes: Any, levels: list[Step]) -> None:
+def _draw_work(axes: Any, levels: list[Rung]) -> None:
     for row, step in enumerate(levels):
         cost = step.cost
         if cost is None:
@@ -133,25 +133,25 @@ def _draw_work(axes: Any, levels: list[Step]) -> None:
 
 
 def _draw_cost(axes: Any, ladder: Ladder, name: str, *, first: bool) -> None:
-    low, high = _dress(axes, ladder, name)
+    low, high = _style_axes(axes, ladder, name)
     for step in ladder.steps:
         if step.stage == "single" and step.cost is not None:
-            place = _placed(step.errors.model[name], low, high)
+            place = _clip_value(step.errors.model[name], low, high)
             axes.plot(place, step.cost.cpu_s * 1e3, marker="x", ms=6, color="0.45", ls="none", zorder=2)
-    engines: dict[str, list[Step]] = {}
+    engines: dict[str, list[Rung]] = {}
     for step in ladder.steps:
         if step.stage == "engine" and not step.measured.failure:
             engines.setdefault(step.measured.candidate.engine, []).append(step)
     for engine, steps in engines.items():
         color, marker = traits(engine).colour, traits(engine).marker
         spent = [step.measured.cpu_s * 1e3 for step in steps]
-        numerical = [_placed(step.errors.numerical[name], low, high) for step in steps]
-        total = [_placed(step.errors.total[name], low, high) for step in steps]
+        numerical = [_clip_value(step.errors.numerical[name], low, high) for step in steps]
+        total = [_clip_value(step.errors.total[name], low, high) for step in steps]
         axes.plot(numerical, spent, color=color, marker=marker, mfc="white", ms=6, ls=":", lw=1.0, zorder=3)
         axes.plot(total, spent, color=color, marker=marker, ms=6, lw=1.6, zorder=3, label=engine)
     picked, errors = ladder.picked, ladder.picked_errors
     axes.plot(
-        _placed(errors.total[name], low, high), picked.cpu_s * 1e3, marker="*", ms=18,
+        _clip_value(errors.total[name], low, high), picked.cpu_s * 1e3, marker="*", ms=18,
         color=traits(picked.candidate.engine).colour, mec=BLACK, ls="none", zorder=4,
         label=f"pick: {picked.candidate.label}",
     )  # fmt: skip

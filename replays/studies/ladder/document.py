@@ -56,7 +56,7 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
             }
             for step in ladder.steps
         ],
-        "pick": pick_of(ladder).model_dump(mode="json"),
+        "pick": make_pick(ladder).model_dump(mode="json"),
         "picked": _run(ladder.picked, scene.duration_s),
         "given": _run(ladder.given, scene.duration_s),
         "full": _run(ladder.full, scene.duration_s),
@@ -66,7 +66,7 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
     }
 
 
-def pick_of(ladder: Ladder) -> Pick:
+def make_pick(ladder: Ladder) -> Pick:
     """Return the pick as stored in a scene."""
     scene, picked, errors = ladder.scene, ladder.picked, ladder.picked_errors
     candidate = picked.candidate

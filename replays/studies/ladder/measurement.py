@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from replays.studies.common.run import Timed, bare_sensors, run_scene
-from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending, find_sliding
+from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, find_ending, find_sliding
 from rig.base.errors import InputError, SimulationError
 from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import COLUMN
@@ -171,7 +171,7 @@ def measure(
     return Measurement(
         candidate=candidate,
         values=values,
-        ending=ending(trace),
+        ending=find_ending(trace),
         cpu_s=statistics.median(each),
         spread_s=(min(each), max(each)),
         runs=len(each),
@@ -180,7 +180,7 @@ def measure(
     )
 
 
-def saving(
+def compute_saving(
     scene: Scene, simpler: Candidate, fuller: Candidate, *, runs: int, sensors: dict[str, Any], limit_s: float
 ) -> float:
     """Return the part of a fuller candidate's processor time that a simpler one saves, with the scene's sensors [1].

@@ -24,7 +24,7 @@ def check_target(path: Path, scene_name: str, scene: Scene) -> None:
     if path.suffix != ".toml":
         raise InputError("--write", "a .toml file", str(path))
     source = path if path.is_file() else scene_path(scene_name)
-    if pick_digests(_as_given(source)) != pick_digests(scene):
+    if pick_digests(_load_scene(source)) != pick_digests(scene):
         must = "the file of the same scene (it must contain the changes by --set)"
         raise InputError("--write", must, str(path))
 
@@ -99,5 +99,5 @@ def _entries(data: dict[str, str | float | bool]) -> list[str]:
     return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in data.items()]
 
 
-def _as_given(path: Path) -> Scene:
+def _load_scene(path: Path) -> Scene:
     return load_scene(path, {"fidelity": "given"})

@@ -51,7 +51,7 @@ class Trace(NamedTuple):
         """Return one signal, shape (n,)."""
         return self.rows[:, COLUMN[name]]
 
-    def settled(self, name: str) -> np.ndarray:
+    def settled_signal(self, name: str) -> np.ndarray:
         """Return one signal in the settled phase."""
         return self.column(name)[-self.settled_rows :]
 
@@ -87,7 +87,7 @@ class Ending(NamedTuple):
         rolls = "rolling" if self.rolling_share > 0.5 else "sliding"
         return f"{rolls} {'forward' if self.turns > 0.0 else 'backward'} whirl" if abs(self.turns) >= 1.0 else "resting"
 
-    def alike(self, other: Ending) -> bool:
+    def is_alike(self, other: Ending) -> bool:
         """Return whether two outcomes are equal; near the limit of two names, a small difference is allowed."""
         if self.touches != other.touches or abs(self.contact_share - other.contact_share) > MAX_SHARE_DIFFERENCE:
             return False
@@ -111,11 +111,11 @@ def find_rolling_start(times_s: np.ndarray, rows: np.ndarray, surface_radius: fl
     return float(times_s[first]) if first < len(times_s) else math.nan
 
 
-def ending(trace: Trace) -> Ending:
+def find_ending(trace: Trace) -> Ending:
     """Return the outcome of a run."""
     # Contact is detected by its impulse, because a contact of an impact law has no duration.
-    pushed = np.diff(trace.settled("contact_impulse")) > 0.0
-    angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
+    pushed = np.diff(trace.settled_signal("contact_impulse")) > 0.0
+    angle = phase(trace.settled_signal("ring_x"), trace.settled_signal("ring_y"))
     rolls = ~find_sliding(trace.rows[-trace.settled_rows :], trace.surface_radius)
     return Ending(
         touches=bool(pushed.any()),
@@ -126,7 +126,7 @@ def ending(trace: Trace) -> Ending:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Measurand:
     """A quantity of a run.
 
     Attributes:
@@ -161,33 +161,33 @@ class Quantity:
 def _whirl_frequency(trace: Trace) -> float:
     if _contact_fraction_settled(trace) < 0.5:
         return math.nan
-    x, y = trace.settled("ring_x"), trace.settled("ring_y")
+    x, y = trace.settled_signal("ring_x"), trace.settled_signal("ring_y")
     return whirl_frequency(x, y, trace.times_s[-trace.settled_rows :], about=0.0)
 
 
 def _contact_fraction_settled(trace: Trace) -> float:
-    return float(np.mean(trace.settled("penetration") > 0.0))
+    return float(np.mean(trace.settled_signal("penetration") > 0.0))
 
 
 def _mean_force(trace: Trace) -> float:
-    impulse = trace.settled("contact_impulse")
+    impulse = trace.settled_signal("contact_impulse")
     return float(impulse[-1] - impulse[0]) / trace.settled_s
 
 
 def _ripple(trace: Trace) -> float:
-    return float(np.std(trace.settled("normal_force")))
+    return float(np.std(trace.settled_signal("normal_force")))
 
 
 def _reaction(trace: Trace) -> float:
-    return float(math.sqrt(2.0) * np.std(trace.settled("P_E") - trace.settled("P_W")))
+    return float(math.sqrt(2.0) * np.std(trace.settled_signal("P_E") - trace.settled_signal("P_W")))
 
 
 def _spin(trace: Trace) -> float:
-    theta = trace.settled("theta")
+    theta = trace.settled_signal("theta")
     return float(theta[-1] - theta[0]) / trace.settled_s / (2.0 * math.pi)
 
 
-def _dissipated(trace: Trace) -> float:
+def _dissipated_energy(trace: Trace) -> float:
     return float(sum(trace.column(name)[-1] for name in DISSIPATED))
 
 
@@ -209,11 +209,11 @@ def _rebound(trace: Trace) -> float:
 def _outcome(trace: Trace) -> str:
     share = _contact_fraction_settled(trace)
     if share == 0.0:
-        impulse = trace.settled("contact_impulse")
+        impulse = trace.settled_signal("contact_impulse")
         return "no contact" if impulse[-1] == impulse[0] else "bouncing"
     if share < 0.95:
         return "bouncing"
-    angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
+    angle = phase(trace.settled_signal("ring_x"), trace.settled_signal("ring_y"))
     if abs(angle[-1] - angle[0]) < 2.0 * math.pi:
         return "resting"
     return "forward whirl" if angle[-1] > angle[0] else "backward whirl"
@@ -231,39 +231,39 @@ _SETTLED = f"last {SETTLED_SHARE:.0%} of the run"
 QUANTITIES = {
     quantity.name: quantity
     for quantity in (
-        Quantity(
+        Measurand(
             "whirl_frequency", "Hz", _SETTLED, "slope of the phase of the shaft in the ring; negative is backward",
             _whirl_frequency,
         ),
-        Quantity("spin", "Hz", _SETTLED, "turns of the shaft over time", _spin),
-        Quantity("mean_normal_force", "N", _SETTLED, "the engine's own contact impulse over time", _mean_force),
-        Quantity(
+        Measurand("spin", "Hz", _SETTLED, "turns of the shaft over time", _spin),
+        Measurand("mean_normal_force", "N", _SETTLED, "the engine's own contact impulse over time", _mean_force),
+        Measurand(
             "force_ripple", "N", _SETTLED, "RMS of the normal force about its mean, every 1 ms", _ripple,
             needs_force=True,
         ),
-        Quantity(
+        Measurand(
             "reaction_amplitude", "N", _SETTLED, "sqrt(2) RMS of P_E - P_W about its mean, every 1 ms", _reaction,
             needs_force=True,
         ),
-        Quantity(
+        Measurand(
             "peak_normal_force", "N", "whole run", "largest by the engine's own steps",
             lambda trace: trace.peak_force, needs_force=True,
         ),
-        Quantity("contact_impulse", "N s", "whole run", "the engine's own integral of the normal force",
+        Measurand("contact_impulse", "N s", "whole run", "the engine's own integral of the normal force",
                  _read_final("contact_impulse")),
-        Quantity("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipated),
-        Quantity("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction),
-        Quantity(
+        Measurand("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipated_energy),
+        Measurand("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction),
+        Measurand(
             "time_to_roll", "s", "transient", f"until it rolls for good (slip below {MAX_ROLLING_SLIP:.0%}), to 50 us",
             lambda trace: trace.rolls_s, resolution=50e-6,
         ),
-        Quantity(
+        Measurand(
             "first_impact_time", "s", "first impact", "located between two steps", lambda trace: trace.first_impact_s
         ),
-        Quantity(
+        Measurand(
             "rebound_height", "m", "first impact", "top of the first rebound above the ring's lowest point", _rebound
         ),
-        Quantity("outcome", "", _SETTLED, "no contact, bouncing, resting, forward whirl or backward whirl", _outcome),
+        Measurand("outcome", "", _SETTLED, "no contact, bouncing, resting, forward whirl or backward whirl", _outcome),
     )
 }  # fmt: skip
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, get_args
 
 from replays.studies.ladder import settings
-from replays.studies.ladder.measurement import Candidate, Measurement, check_reads, measure, saving
+from replays.studies.ladder.measurement import Candidate, Measurement, check_reads, compute_saving, measure
 from replays.studies.ladder.quantity import QUANTITIES, Value
 from rig.base.errors import InputError
 from rig.physics.engines import ENGINES
@@ -45,7 +45,7 @@ class Errors:
     numerical: dict[str, float] = field(default_factory=dict)
     total: dict[str, float] = field(default_factory=dict)
 
-    def worst(self, tolerances: dict[str, float]) -> float:
+    def largest_error(self, tolerances: dict[str, float]) -> float:
         """Return the largest error in units of the tolerance; infinite if a quantity is missing."""
         ratios = [
             value / tolerances[name]
@@ -57,7 +57,7 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Step:
+class Rung:
     """One candidate of the search and its verdict."""
 
     stage: str
@@ -97,7 +97,7 @@ class Ladder:
     reference: Measurement
     unlike: Measurement
     reference_errors: dict[str, float]
-    steps: tuple[Step, ...]
+    steps: tuple[Rung, ...]
     picked: Measurement
     picked_errors: Errors
     savings: dict[str, float]
@@ -152,10 +152,11 @@ def search(
             picked = _select_cheapest(work, passing)
         else:
             break
-    given = work.run(settings.as_given(scene), sensors={})
-    full = work.run(standard.full.with_engine(*settings.usual(scene, standard.full, settings.REFERENCE[0])), sensors={})
+    given = work.run(settings.own_candidate(scene), sensors={})
+    setting = settings.own_setting(scene, standard.full, settings.REFERENCE[0])
+    full = work.run(standard.full.with_engine(*setting), sensors={})
     own = _run_as_given(work, standard)
-    if own.passes and work.saving(picked.measured.candidate, own.measured.candidate) <= MIN_SAVING:
+    if own.passes and work.compute_saving(picked.measured.candidate, own.measured.candidate) <= MIN_SAVING:
         picked, savings = own, savings if own.measured.candidate == picked.measured.candidate else {}
     return Ladder(
         scene=scene,
@@ -168,7 +169,7 @@ def search(
         picked_errors=picked.errors,
         savings=savings,
         given=given,
-        given_errors=standard.against(given.values, standard.reference.values),
+        given_errors=standard.compare(given.values, standard.reference.values),
         full=full,
         sensors=chain,
         spent_s=work.spent_s,
@@ -187,7 +188,7 @@ class _Search:
     progress: Callable[[str], None]
     sensors: dict[str, Any]
     """Sensor settings of the pick."""
-    steps: list[Step] = field(default_factory=list)
+    steps: list[Rung] = field(default_factory=list)
     _begin: float = field(default_factory=time.perf_counter)
 
     @property
@@ -209,16 +210,16 @@ class _Search:
 
     def cost(self, candidate: Candidate) -> Measurement:
         """Measure a model with the scene's sensors, on the first engine that supports it, at its own step."""
-        return self.run(self.usual(candidate), sensors=self.sensors)
+        return self.run(self.assign_engine(candidate), sensors=self.sensors)
 
-    def usual(self, candidate: Candidate) -> Candidate:
+    def assign_engine(self, candidate: Candidate) -> Candidate:
         """Return a model on the first engine that supports it."""
-        engine = next(engine for engine in ENGINES if settings.takes(engine, candidate))
-        return candidate.with_engine(*settings.usual(self.scene, candidate, engine))
+        engine = next(engine for engine in ENGINES if settings.supports(engine, candidate))
+        return candidate.with_engine(*settings.own_setting(self.scene, candidate, engine))
 
-    def saving(self, simpler: Candidate, fuller: Candidate) -> float:
+    def compute_saving(self, simpler: Candidate, fuller: Candidate) -> float:
         """Return the part of the fuller candidate's cost that the simpler one saves."""
-        return saving(self.scene, simpler, fuller, runs=self.runs, sensors=self.sensors, limit_s=self.left_s)
+        return compute_saving(self.scene, simpler, fuller, runs=self.runs, sensors=self.sensors, limit_s=self.left_s)
 
 
 class _Reference(NamedTuple):
@@ -232,20 +233,20 @@ class _Reference(NamedTuple):
     allowed: dict[str, float]
     """Tolerances minus the reference's own error."""
 
-    def against(self, values: dict[str, Value], others: dict[str, Value]) -> dict[str, float]:
+    def compare(self, values: dict[str, Value], others: dict[str, Value]) -> dict[str, float]:
         """Return the errors of values against others."""
         return {name: QUANTITIES[name].error(values[name], others[name]) for name in values}
 
     def model_errors(self, converged: Measurement) -> Errors:
         """Return the errors of a model from its converged run."""
-        return Errors(model=self.against(converged.values, self.reference.values))
+        return Errors(model=self.compare(converged.values, self.reference.values))
 
     def all_errors(self, done: Measurement, best: Measurement) -> Errors:
         """Return the errors of an engine's run of the picked model."""
         return Errors(
-            self.against(best.values, self.reference.values),
-            self.against(done.values, best.values),
-            self.against(done.values, self.reference.values),
+            self.compare(best.values, self.reference.values),
+            self.compare(done.values, best.values),
+            self.compare(done.values, self.reference.values),
         )
 
     def step(
@@ -257,13 +258,13 @@ class _Reference(NamedTuple):
         *,
         cost: Measurement | None = None,
         note: str = "",
-    ) -> Step:
+    ) -> Rung:
         """Return a candidate with its verdict: errors within the tolerances, and the outcome of the full model."""
         alike = _have_same_outcome(measured, self.reference)
-        passes = not measured.failure and errors.worst(self.allowed) <= 1.0 and alike
+        passes = not measured.failure and errors.largest_error(self.allowed) <= 1.0 and alike
         if not alike and measured.ending is not None:
             note = f"another outcome: {measured.ending.word}"
-        return Step(stage, label, measured, errors, passes, cost=cost, note=measured.failure or note)
+        return Rung(stage, label, measured, errors, passes, cost=cost, note=measured.failure or note)
 
 
 def _run_reference(work: _Search) -> _Reference:
@@ -276,7 +277,7 @@ def _run_reference(work: _Search) -> _Reference:
     # For model levels the last choice is the full one; the drive stays the scene's own.
     levels: Any = {name: choices[-1] for name, choices in LEVELS.items() if name != "drive"}
     full = Candidate(ModelLevels(**levels), work.scene.drive.mode, *settings.REFERENCE)
-    other = full.with_engine(*settings.finest(settings.UNLIKE))
+    other = full.with_engine(*settings.finest_setting(settings.UNLIKE))
     work.progress(f"full model, {full.method}, and {other.method} for comparison")
     reference = work.run(full)
     unlike = work.run(other, runs=1)
@@ -290,7 +291,7 @@ def _run_reference(work: _Search) -> _Reference:
         must = f"one with the same outcome on two accurate engines ({' and '.join(endings)} depend on chance)"
         raise InputError("scene", must, work.scene.name)
     standard = _Reference(full, reference, unlike, {}, {})
-    distances = standard.against(unlike.values, reference.values)
+    distances = standard.compare(unlike.values, reference.values)
     own = {name: max(error, _resolution(name, reference)) for name, error in distances.items()}
     for name, error in own.items():
         if error > 0.5:
@@ -327,7 +328,7 @@ def _lower_each(work: _Search, standard: _Reference, keep: tuple[str, ...]) -> d
             errors = standard.model_errors(converged)
             steps.append(standard.step("single", f"{level} {choice}", converged, errors, cost=cost, note=note))
             if steps[-1].passes and choice not in STAND_INS and level not in keep:
-                passing.setdefault(level, {})[choice] = errors.worst(standard.allowed)
+                passing.setdefault(level, {})[choice] = errors.largest_error(standard.allowed)
     return passing
 
 
@@ -381,17 +382,17 @@ def _restore_levels(
     """
     savings: dict[str, float] = {}
 
-    def placed(levels: dict[str, str], other: dict[str, str]) -> Candidate:
+    def combine(levels: dict[str, str], other: dict[str, str]) -> Candidate:
         both = [standard.full.with_model(**each) for each in (levels, other)]
-        if setting is None or not all(settings.takes(setting.engine, each) for each in both):
-            return work.usual(both[0])
+        if setting is None or not all(settings.supports(setting.engine, each) for each in both):
+            return work.assign_engine(both[0])
         return both[0].with_engine(setting.engine, setting.step_us, setting.tolerance)
 
     for level in list(chosen):
         for choice in (None, *reversed(_fuller_choices(single, chosen, level))):
             fuller = _raise_level(chosen, level, choice)
             work.progress(f"what {level} {chosen[level]} saves")
-            part = work.saving(placed(chosen, fuller), placed(fuller, chosen))
+            part = work.compute_saving(combine(chosen, fuller), combine(fuller, chosen))
             if part <= MIN_SAVING:
                 chosen = fuller
                 savings.pop(level, None)
@@ -400,16 +401,16 @@ def _restore_levels(
     return chosen, savings
 
 
-def _search_engines(work: _Search, standard: _Reference, best: Measurement) -> tuple[list[tuple[Step, int]], bool]:
+def _search_engines(work: _Search, standard: _Reference, best: Measurement) -> tuple[list[tuple[Rung, int]], bool]:
     """Run engines and steps, finest first; a setting passes only if all finer ones of its engine pass.
 
     Returns:
         Passing steps, each with the engine's index, and whether every engine was tried.
     """
-    passing: list[tuple[Step, int]] = []
+    passing: list[tuple[Rung, int]] = []
     complete = True
-    for place, (engine, tried) in enumerate(settings.tried(work.scene, best.candidate).items()):
-        for step_us, tolerance in tried:
+    for place, (engine, step_settings) in enumerate(settings.list_settings(work.scene, best.candidate).items()):
+        for step_us, tolerance in step_settings:
             if work.left_s <= _VERIFICATION_SHARE * work.budget_s and passing:
                 complete = False
                 break
@@ -427,7 +428,7 @@ def _search_engines(work: _Search, standard: _Reference, best: Measurement) -> t
     return passing, complete
 
 
-def _select_cheapest(work: _Search, passing: list[tuple[Step, int]]) -> Step:
+def _select_cheapest(work: _Search, passing: list[tuple[Rung, int]]) -> Rung:
     """Return the cheapest passing step.
 
     Raises:
@@ -441,20 +442,20 @@ def _select_cheapest(work: _Search, passing: list[tuple[Step, int]]) -> Step:
     return min(near, key=_sort_key)[0]
 
 
-def _run_as_given(work: _Search, standard: _Reference) -> Step:
+def _run_as_given(work: _Search, standard: _Reference) -> Rung:
     """Run the scene's own model, engine and step for comparison with the pick."""
-    own = settings.as_given(work.scene)
+    own = settings.own_candidate(work.scene)
     work.progress("the scene as it is given")
     converged, done = work.run(settings.converged(own), runs=1), work.run(own, sensors=work.sensors)
     work.steps.append(standard.step("given", f"as given: {own.method}", done, standard.all_errors(done, converged)))
     return work.steps[-1]
 
 
-def _sort_key(entry: tuple[Step, int]) -> tuple[float, ...]:
+def _sort_key(entry: tuple[Rung, int]) -> tuple[float, ...]:
     """Return the sort key of equally cheap steps: earlier engine, longer step, wider tolerance."""
     step, place = entry
     return place, -step.measured.candidate.step_us, -step.measured.candidate.tolerance
 
 
 def _have_same_outcome(one: Measurement, other: Measurement) -> bool:
-    return one.ending is not None and other.ending is not None and one.ending.alike(other.ending)
+    return one.ending is not None and other.ending is not None and one.ending.is_alike(other.ending)

@@ -16,7 +16,7 @@ _GRIDS = (1000, 500, 250, 200, 125, 100, 50, 25, 20, 10, 5)
 _STEPS = (1, 2, 5, 10, 20, 25, 40, 50, 100)
 
 
-def takes(engine: str, candidate: Candidate) -> bool:
+def supports(engine: str, candidate: Candidate) -> bool:
     """Return whether an engine supports a model."""
     method = ENGINES[engine]
     return candidate.levels.friction in method.frictions and candidate.levels.contact in method.contacts
@@ -24,23 +24,23 @@ def takes(engine: str, candidate: Candidate) -> bool:
 
 def converged(candidate: Candidate) -> Candidate:
     """Return a model on the reference engine, or on the cross-check engine if the former does not support it."""
-    return candidate.with_engine(*(REFERENCE if takes(REFERENCE[0], candidate) else finest(UNLIKE)))
+    return candidate.with_engine(*(REFERENCE if supports(REFERENCE[0], candidate) else finest_setting(UNLIKE)))
 
 
-def finest(engine: str) -> tuple[str, int, float]:
+def finest_setting(engine: str) -> tuple[str, int, float]:
     """Return an engine at its finest setting."""
     method = ENGINES[engine]
     return (engine, method.step_us, _FINEST_FACTOR * method.tolerance) if method.tolerance else (engine, 1, 0.0)
 
 
-def usual(scene: Scene, candidate: Candidate, engine: str) -> tuple[str, int, float]:
+def own_setting(scene: Scene, candidate: Candidate, engine: str) -> tuple[str, int, float]:
     """Return an engine at its own tolerance and step, or at the longest shorter step that fits the sample rates."""
     method = ENGINES[engine]
     steps = (step for step in _GRIDS if step <= method.step_us and _fits(scene, candidate, engine, step))
     return engine, next(steps, method.step_us), method.tolerance
 
 
-def as_given(scene: Scene) -> Candidate:
+def own_candidate(scene: Scene) -> Candidate:
     """Return the scene's own model, engine and step."""
     engine = scene.engine
     return Candidate(
@@ -48,11 +48,11 @@ def as_given(scene: Scene) -> Candidate:
     )
 
 
-def tried(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float]]]:
+def list_settings(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float]]]:
     """Return steps and tolerances, finest first, of every engine that supports a model and fits the sample rates."""
     found: dict[str, list[tuple[int, float]]] = {}
     for engine, method in ENGINES.items():
-        if not takes(engine, candidate):
+        if not supports(engine, candidate):
             continue
         if method.tolerance:
             grids = [step for step in _GRIDS if step <= method.step_us and _fits(scene, candidate, engine, step)]

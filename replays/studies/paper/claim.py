@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, house_style, legend_below, new_figure
-from replays.studies.paper.scans.pulse import BANDWIDTH, MEASURED_N, Outcome, Pulse
+from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, add_legend, house_style, new_figure
+from replays.studies.paper.scans.pulse import BANDWIDTH, MEASURED_N, Pulse, PulseRun
 from replays.studies.paper.scans.spread import column, free_values, one_at_a_time, phases, rank_correlation
 from rig.physics.parameters import load_parameters
 
@@ -35,7 +35,7 @@ ENDS = ("low", "high")
 LAWS = ("exact", "lankarani-nikravesh", "none", "hunt-crossley", "flores", "kelvin-voigt")
 
 Groups = dict[str, list[Pulse]]
-Results = dict[str, list[Outcome]]
+Results = dict[str, list[PulseRun]]
 
 
 def correction_keys() -> list[str]:
@@ -60,7 +60,7 @@ def claim_groups(*, ensemble: int) -> Groups:
         changed = Pulse(label=key, parameters="as-printed", changes={key: corrected[key].value})
         groups[f"correction {key}"] = phases(changed, ensemble)
     for scale in SCALES:
-        changed = replace(base, label=f"housing x {scale:g}", changes=supports(scale))
+        changed = replace(base, label=f"housing x {scale:g}", changes=scale_supports(scale))
         groups[f"mobility {scale:g}"] = phases(changed, ensemble)
     for name, changed in alternatives().items():
         groups[f"alternative {name}"] = phases(replace(changed, label=name), ensemble)
@@ -76,15 +76,15 @@ def claim_groups(*, ensemble: int) -> Groups:
     return groups
 
 
-def supports(scale: float) -> dict[str, Any]:
+def scale_supports(scale: float) -> dict[str, Any]:
     """Return scaled stiffness and damping of all supports of the houses."""
     corrected = load_parameters("corrected").entries
     return {key: float(corrected[key].value) * scale for key in HOUSE_KEYS}
 
 
-def less_mobile() -> dict[str, dict[str, Any]]:
+def stiffer_houses() -> dict[str, dict[str, Any]]:
     """Return less mobile houses by name."""
-    return {"× 3": supports(3.0), "× 10": supports(10.0), "rigid": {"model.stator": "rigid"}}
+    return {"× 3": scale_supports(3.0), "× 10": scale_supports(10.0), "rigid": {"model.stator": "rigid"}}
 
 
 def alternatives() -> dict[str, Pulse]:
@@ -99,7 +99,7 @@ def alternatives() -> dict[str, Pulse]:
     }
 
 
-def median(results: list[Outcome], name: str) -> float:
+def median(results: list[PulseRun], name: str) -> float:
     """Return the median over the runs of a group that have the number; NaN if none has."""
     values = column(results, name)
     values = values[np.isfinite(values)]
@@ -134,28 +134,28 @@ def bars(results: Results, quantity: str) -> list[Bar]:
     """
     base, printed = (median(results[f"base {name}"], quantity) for name in ("corrected", "as-printed"))
 
-    def of(group: str) -> float:
+    def get(group: str) -> float:
         return median(results[group], quantity)
 
     found = [
-        Bar(entry.called, "assumed value", (of(f"low {entry.key}"), base, of(f"high {entry.key}")))
+        Bar(entry.called, "assumed value", (get(f"low {entry.key}"), base, get(f"high {entry.key}")))
         for entry in free_values()
     ]
-    found += [Bar(CORRECTIONS[key], "correction", (printed, of(f"correction {key}"))) for key in correction_keys()]
+    found += [Bar(CORRECTIONS[key], "correction", (printed, get(f"correction {key}"))) for key in correction_keys()]
     found.append(Bar("all corrections", "correction", (printed, base)))
-    found.append(Bar("supports, 1/10 to 10 times as stiff", "housing", (of("mobility 0.1"), base, of("mobility 10"))))
-    found += [Bar(name, "other reading", (base, of(f"alternative {name}"))) for name in alternatives()]
-    found.append(Bar("contact law", "other reading", tuple(of(f"law {law}") for law in LAWS)))
+    found.append(Bar("supports, 1/10 to 10 times as stiff", "housing", (get("mobility 0.1"), base, get("mobility 10"))))
+    found += [Bar(name, "other reading", (base, get(f"alternative {name}"))) for name in alternatives()]
+    found.append(Bar("contact law", "other reading", tuple(get(f"law {law}") for law in LAWS)))
     return sorted(found, key=lambda bar: -bar.width)
 
 
-def toward_measured(found: list[Bar]) -> list[Bar]:
+def select_lower_ends(found: list[Bar]) -> list[Bar]:
     """Return the bars with an end below the last label of the measured axis."""
     return [bar for bar in found if any(value <= MEASURED_N for value in bar.values)]
 
 
 @house_style()
-def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
+def draw_tornado(results: Results, spread: list[PulseRun]) -> Figure:
     """Draw the effect of each change on the force in whirl and on the highest reaction."""
     from matplotlib.patches import Patch
 
@@ -207,7 +207,7 @@ def _draw_bars(axes: Any, widest: list[Bar], level: float) -> None:
 
 
 @house_style()
-def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
+def draw_spread(parts: np.ndarray, spread: list[PulseRun]) -> Figure:
     """Draw the distributions with all assumed values varied together, and the rank correlation of each value."""
     figure = new_figure(8.4, f"All assumed values varied together: Latin hypercube, {len(spread)} runs")
     panels = figure.subplots(2, 2).ravel()
@@ -239,7 +239,7 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
     panels[3].set_yticks(rows, [entry.called for entry in entries])
     panels[3].invert_yaxis()
     panels[3].set(xlabel="rank correlation [1]", xlim=(-1.05, 1.05))
-    legend_below(figure)
+    add_legend(figure)
     return figure
 
 
@@ -264,5 +264,5 @@ def draw_mobility(results: Results) -> Figure:
         axes.set(ylabel=label)
     for axes in panels[-1]:
         axes.set_xlabel("factor on the supports [1]")
-    legend_below(figure)
+    add_legend(figure)
     return figure

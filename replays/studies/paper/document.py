@@ -26,7 +26,7 @@ from replays.studies.paper.claim import (
     draw_spread,
     draw_tornado,
     median,
-    toward_measured,
+    select_lower_ends,
 )
 from replays.studies.paper.figures import figure
 from replays.studies.paper.figures.chart import draw_conditions, draw_law, draw_verdicts
@@ -80,9 +80,9 @@ def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | Non
     )
     text = template.render(quick=quick, **_numbers(findings))
     title, lead, *blocks = re.split(r"\n\s*\n", text.strip())
-    report = Report(in_print(title), in_print(lead), origin=origin)
+    report = Report(typeset(title), typeset(lead), origin=origin)
     for block in blocks:
-        words = in_print(block)
+        words = typeset(block)
         placed = _PLACED.fullmatch(words)
         if placed:
             _place(report, findings, placed)
@@ -96,7 +96,7 @@ def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | Non
     return report
 
 
-def in_print(text: str) -> str:
+def typeset(text: str) -> str:
     """Join the lines of a text and typeset its symbols, powers of ten and signs."""
     words = " ".join(text.split())
     for written, printed in _PRINT:
@@ -104,18 +104,18 @@ def in_print(text: str) -> str:
     return words
 
 
-def _printed(content: Content) -> Content:
+def _typeset_table(content: Content) -> Content:
     """Format the cells of a table as in print."""
-    rows = [Row(tuple(map(in_print, row.cells)), row.mark) for row in content.rows]
-    return Content(tuple(map(in_print, content.headings)), rows)
+    rows = [Row(tuple(map(typeset, row.cells)), row.mark) for row in content.rows]
+    return Content(tuple(map(typeset, content.headings)), rows)
 
 
 def _add_table(report: Report, block: str) -> None:
     """Add a table from the text: caption, headings, rows; an indented line continues the previous one."""
     lines = re.sub(r"\n\s+", " ", block).split("\n")
     first = next(n for n, line in enumerate(lines) if _CELLS in line)
-    headings, *rows = ([in_print(cell) for cell in line.split(_CELLS)] for line in lines[first:])
-    report.table(headings, rows, caption=in_print(" ".join(lines[:first])))
+    headings, *rows = ([typeset(cell) for cell in line.split(_CELLS)] for line in lines[first:])
+    report.table(headings, rows, caption=typeset(" ".join(lines[:first])))
 
 
 def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
@@ -126,9 +126,9 @@ def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
     elif placed["kind"] == "verdicts":
         lines = [*findings.lines, *findings.claims]
         kept = [line for line in lines if line.statement.quantity.startswith(tuple(name.split()))]
-        report.table(*_printed(summary(kept)))
+        report.table(*_typeset_table(summary(kept)))
     else:
-        report.table(*_printed(TABLES[name](findings)), caption=caption)
+        report.table(*_typeset_table(TABLES[name](findings)), caption=caption)
 
 
 _PICTURES: dict[str, Callable[[Findings], Figure]] = {
@@ -194,20 +194,20 @@ def _moves(findings: Findings) -> dict[str, Any]:
     """Return the changes that move the force toward the measured one."""
     results = findings.results
 
-    def of(group: str, quantity: str = "reaction_x_n") -> float:
+    def get(group: str, quantity: str = "reaction_x_n") -> float:
         return median(results[group], quantity)
 
-    reached = toward_measured(bars(results, "reaction_x_n"))
+    reached = select_lower_ends(bars(results, "reaction_x_n"))
     whirling = [result for result in findings.spread if result.whirls]
     ranks = np.nan_to_num(rank_correlation(findings.parts, column(findings.spread, "reaction_x_n")))
     first = int(np.argmax(np.abs(ranks)))
     low_passes = zip(BANDWIDTHS_HZ, results["bandwidth"], strict=True)
     return {
-        "printed": of("base as-printed"),
-        "base": of("base corrected"),
-        "base_peak": of("base corrected", "peak_x_n"),
-        "stiffer": of("mobility 10"),
-        "stiffer_peak": of("mobility 10", "peak_x_n"),
+        "printed": get("base as-printed"),
+        "base": get("base corrected"),
+        "base_peak": get("base corrected", "peak_x_n"),
+        "stiffer": get("mobility 10"),
+        "stiffer_peak": get("mobility 10", "peak_x_n"),
         "reached": {
             kind: ", ".join(bar.name for bar in reached if bar.kind == kind) or "none"
             for kind in ("correction", "assumed value", "housing", "other reading")
@@ -289,7 +289,7 @@ def _whirl(findings: Findings) -> dict[str, Any]:
         },
         "starts": findings.starts,
         "slips": findings.slips,
-        "kept": {"share": condition.spin_kept(constants), "spin_hz": 6.2 * condition.spin_kept(constants)},
+        "kept": {"share": condition.remaining_spin(constants), "spin_hz": 6.2 * condition.remaining_spin(constants)},
         "lowest_hz": percentiles(column(findings.spread, "slowest_hz")),
         "turned": {"whirl_hz": turned / (2 * math.pi), "friction": own.ratio / share},
         "sweep": sweep,

@@ -14,12 +14,12 @@ from itertools import pairwise
 import numpy as np
 
 from replays.report import Mark, Row
-from replays.studies.paper.claim import ENDS, LAWS, Groups, Results, claim_groups, less_mobile, median
+from replays.studies.paper.claim import ENDS, LAWS, Groups, Results, claim_groups, median, stiffer_houses
 from replays.studies.paper.open_questions import question_groups
 from replays.studies.paper.reproduction import SPEEDS_HZ, Reproduction, drop_spread, pulse_spread, reproduce
 from replays.studies.paper.scans import condition
 from replays.studies.paper.scans.condition import Slip, Start, Threshold
-from replays.studies.paper.scans.pulse import HAMMER_MS, Outcome, Pulse, outcomes, pulse_model
+from replays.studies.paper.scans.pulse import HAMMER_MS, Pulse, PulseRun, outcomes, pulse_model
 from replays.studies.paper.scans.spread import column, hypercube, phases
 from replays.studies.paper.statement import SETS, Statement, claims, distribution, statements
 from rig.physics.kernels.constants import Constants
@@ -83,8 +83,8 @@ class Findings:
     found: dict[str, Reproduction]
     results: Results
     parts: np.ndarray
-    spread: list[Outcome]
-    sweep: dict[float, Outcome]
+    spread: list[PulseRun]
+    sweep: dict[float, PulseRun]
     starts: list[Start]
     slowest: list[Threshold]
     least: list[Threshold]
@@ -104,7 +104,7 @@ LENGTHS_MS = (4.0, 5.0, 6.0)
 """Pulse lengths for which the impacts of Fig. 15 are shown over the phases [ms]."""
 
 
-def planned_groups(*, quick: bool) -> Groups:
+def list_groups(*, quick: bool) -> Groups:
     """Return every pulse to run, by group."""
     ensemble, few = (2, 4) if quick else (9, 40)
     groups = {**claim_groups(ensemble=ensemble), **question_groups(ensemble=ensemble)}
@@ -118,7 +118,7 @@ def planned_groups(*, quick: bool) -> Groups:
             replace(pulse, duration_s=longer) for pulse in groups[f"spread {name}"][: few // 4]
         ]
         groups[f"slow {name}"] = [replace(pulse, speed_hz=SPEEDS_HZ[0]) for pulse in groups[f"spread {name}"][:few]]
-    for name, changed in less_mobile().items():
+    for name, changed in stiffer_houses().items():
         some = groups["spread corrected"][:few]
         groups[f"spread {name}"] = [replace(pulse, changes={**pulse.changes, **changed}) for pulse in some]
     return {**groups, "sweep": condition.sweep_pulses(SWEEP_HZ[1:6:2] if quick else SWEEP_HZ)}
@@ -127,7 +127,7 @@ def planned_groups(*, quick: bool) -> Groups:
 def steps(*, quick: bool) -> int:
     """Return the number of progress reports of `find`."""
     each = len(SETS) * (len(SPEEDS_HZ) + 4)
-    return each + sum(len(group) for group in planned_groups(quick=quick).values()) + len(_forces(quick=quick)) + 3
+    return each + sum(len(group) for group in list_groups(quick=quick).values()) + len(_forces(quick=quick)) + 3
 
 
 def _forces(*, quick: bool) -> tuple[float, ...]:
@@ -145,7 +145,7 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
     """
     report = progress or (lambda _: None)
     found = {name: reproduce(name, quick=quick, progress=report) for name in SETS}
-    groups = planned_groups(quick=quick)
+    groups = list_groups(quick=quick)
     pulses: list[Pulse] = [pulse for group in groups.values() for pulse in group]
     done = list(outcomes(pulses, processes=processes, progress=report))
     ends = np.cumsum([0, *(len(group) for group in groups.values())])
@@ -158,7 +158,7 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
     report("slowest whirl that friction keeps up")
     least = condition.sustain_thresholds((6.2,)) if quick else condition.sustain_thresholds()
     report("least friction that keeps up whirl")
-    slips = condition.slips_to_rolling()
+    slips = condition.find_slips()
     report("from slipping to rolling")
     drops = {}
     for name in SETS:
@@ -192,7 +192,7 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
     """Return the numbers for each claim from all relevant runs and readings, each of shape (n,)."""
     results = findings.results
 
-    def stiffer(houses: Iterable[str], *quantities: str) -> np.ndarray:
+    def stiffness_ratios(houses: Iterable[str], *quantities: str) -> np.ndarray:
         """Return ratios of less mobile houses to the corrected ones in the same run; all are readings."""
         found = []
         for each in (results[f"spread {name}"] for name in houses):
@@ -210,10 +210,10 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
     ):
         both_sides.append(conditions(pulse_model(pulse, pulse.changes).constants, result.whirl_hz))
     found = {
-        "house_raises": 1.0 / stiffer(["rigid"], "reaction_x_n"),
-        "house_ripple": 1.0 / stiffer(["rigid"], "ripple_n"),
-        "stiff_bouncing": stiffer(less_mobile(), "contacts", "roll_s", "rebound_m_s"),
-        "stiff_force": stiffer(less_mobile(), "peak_normal_n", "true_peak_x_n", "true_peak_y_n"),
+        "house_raises": 1.0 / stiffness_ratios(["rigid"], "reaction_x_n"),
+        "house_ripple": 1.0 / stiffness_ratios(["rigid"], "ripple_n"),
+        "stiff_bouncing": stiffness_ratios(stiffer_houses(), "contacts", "roll_s", "rebound_m_s"),
+        "stiff_force": stiffness_ratios(stiffer_houses(), "peak_normal_n", "true_peak_x_n", "true_peak_y_n"),
         "law_whirl": laws("reaction_x_n", *other, *(f"{end} contact.stiffness" for end in ENDS)),
         "law_peak": 100.0 * np.abs(laws("peak_normal_n", *other) - 1.0),
         **dict(zip(("centrifugal", "critical", "eigenfrequency"), np.array(both_sides).T, strict=True)),

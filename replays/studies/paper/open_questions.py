@@ -56,7 +56,7 @@ def compute_fall(constants: Constants) -> tuple[float, float]:
     return math.sqrt(2.0 * height / a), math.sqrt(2.0 * a * height)
 
 
-def weight_at_ring(constants: Constants) -> float:
+def ring_weight(constants: Constants) -> float:
     """Return the shaft's weight at the ring [N], the mean force of a drop from release to rest."""
     shaft = constants.shaft
     return shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring
@@ -68,33 +68,33 @@ def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
     contact, masses = model.constants.contact, reference_impact(model.parameters)
     time_s, speed = compute_fall(model.constants)
 
-    def hit(mass: float, at: float = speed, stiffness: float = contact.stiffness) -> Impact:
+    def compute_impact(mass: float, at: float = speed, stiffness: float = contact.stiffness) -> Impact:
         return impact(
             mass=mass, speed=at, stiffness=stiffness, exponent=contact.exponent, factor=contact.damping_factor,
             speed_floor=contact.speed_floor,
         )  # fmt: skip
 
-    stiffness = _where_peak_is_printed(lambda k: hit(masses.shaft_mass, stiffness=k).peak, 1e4, 1e12)
-    slow = _where_peak_is_printed(lambda v: hit(masses.mass, v).peak, 2e-3, 1.0)
-    free = hit(masses.mass)
+    stiffness = _find_printed_peak(lambda k: compute_impact(masses.shaft_mass, stiffness=k).peak, 1e4, 1e12)
+    slow = _find_printed_peak(lambda v: compute_impact(masses.mass, v).peak, 2e-3, 1.0)
+    free = compute_impact(masses.mass)
     half_sine_ms = 1e3 * math.pi / 2.0 * free.impulse / PAPER_DROP_N
     return {
         "fall_ms": time_s * 1e3,
         "speed": speed,
         "free": free,
-        "fixed": hit(masses.shaft_mass),
+        "fixed": compute_impact(masses.shaft_mass),
         "runs": {name: _drop_run(one) for name, one in found.items()},
-        "amplified": _amplified(found["corrected"].drop),
+        "amplified": _amplification(found["corrected"].drop),
         "half_sine_ms": half_sine_ms,
         "ratio": half_sine_ms / (free.duration * 1e3),
         "soft": {
             "stiffness": stiffness,
             "times": contact.stiffness / stiffness,
-            "depth_mm": hit(masses.shaft_mass, stiffness=stiffness).depth * 1e3,
+            "depth_mm": compute_impact(masses.shaft_mass, stiffness=stiffness).depth * 1e3,
         },
         "clearance_mm": contact.clearance * 1e3,
         "height_um": 1e6 * 2.0 * contact.clearance * (slow / speed) ** 2,
-        "weight": weight_at_ring(model.constants),
+        "weight": ring_weight(model.constants),
         "house_n": 100.0 * model.constants.house.inner_mass,
         "house_g_n": 100.0 * G * model.constants.house.inner_mass,
     }
@@ -113,7 +113,7 @@ def _drop_run(one: Reproduction) -> Numbers:
     }
 
 
-def _amplified(run: Run) -> Numbers:
+def _amplification(run: Run) -> Numbers:
     """Return the largest reaction relative to its own contact force and to that of a rigid house."""
     reaction = float((run["P_S"] - run["P_N"]).max())
     rigid = bare_drop({"model.stator": "rigid"})
@@ -123,7 +123,7 @@ def _amplified(run: Run) -> Numbers:
     }
 
 
-def _where_peak_is_printed(peak: Callable[[float], float], low: float, high: float) -> float:
+def _find_printed_peak(peak: Callable[[float], float], low: float, high: float) -> float:
     """Return the argument at which an increasing peak [N] equals the printed one, by a logarithmic search."""
     from scipy.optimize import brentq
 
@@ -178,32 +178,32 @@ def magnet_numbers() -> Numbers:
     base = load_parameters("corrected")
     used = base["magnet.stiffness"] / 1e3
     most = int(math.pi / math.asin(base["magnet.bearing_magnet_radius"] / base["magnet.bearing_radius"]))
-    tried: dict[tuple[int, float], tuple[float, float]] = {}
+    values: dict[tuple[int, float], tuple[float, float]] = {}
     for count in (8, most):
         for length in _LENGTHS_MM:
             geometry = magnet_geometry(base.override({"magnet.count": float(count), "magnet.length": length}))
-            tried[count, length] = field_sum_stiffness(geometry) / 1e3, cylinder_stiffness(geometry) / 1e3
-    best = tried[8, 16.9][1]
+            values[count, length] = field_sum_stiffness(geometry) / 1e3, cylinder_stiffness(geometry) / 1e3
+    best = values[8, 16.9][1]
     return {
-        "tried": tried,
+        "tried": values,
         "used_kn_m": used,
         "best_kn_m": best,
-        "enough": next((magnets for magnets, (_, exact) in tried.items() if round(exact, 2) >= used), None),
+        "enough": next((magnets for magnets, (_, exact) in values.items() if round(exact, 2) >= used), None),
     }
 
 
 def running_numbers() -> Numbers:
     """Return w_n [Hz] and the smallest gap [mm] by stiffness [kN/m], to find those without contact."""
-    tried = {}
+    values = {}
     for stiffness in STIFFNESSES_KN_M:
         changes = {"duration_s": 3.0, "magnet.stiffness": stiffness, "sensors.chain": "ideal", "sensors.rate_hz": 2000}
         run = simulate(load_scene("stable-run", {**changes, "sensors.groups": ["hammer"]}))
         natural_hz = oscillator(run.simulation.model.constants).natural / (2.0 * math.pi)
-        tried[stiffness] = natural_hz, -1e3 * float(run["penetration"].max())
-    return {"tried": tried, "free": [stiffness for stiffness, (_, gap_mm) in tried.items() if gap_mm > 0.0]}
+        values[stiffness] = natural_hz, -1e3 * float(run["penetration"].max())
+    return {"tried": values, "free": [stiffness for stiffness, (_, gap_mm) in values.items() if gap_mm > 0.0]}
 
 
-class Axis(NamedTuple):
+class PaperAxis(NamedTuple):
     """An axis of the paper and the clearances that it allows."""
 
     name: str
@@ -223,21 +223,21 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
 
     stated = {each.quantity: (each.low, each.high) for each in statements()}
 
-    def axis(name: str, ours: float, quantity: str) -> Axis:
+    def make_axis(name: str, ours: float, quantity: str) -> PaperAxis:
         # At equal spin and R_S / r0, lengths and forces of the whirl are proportional to r0.
         low, high = stated[quantity]
-        return Axis(name, ours, low, high, (r0 * low / ours, r0 * high / ours))
+        return PaperAxis(name, ours, low, high, (r0 * low / ours, r0 * high / ours))
 
-    orbit = axis("orbit ±1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], "orbit_ring")
-    drop = axis("drop ±1 mm, in the ring, Fig. 10", r0, "drop_span")
-    probes = axis("drop ±1 mm, at the probes, Fig. 10", r0 * lever, "drop_span")
-    disk = axis("x(t) ±2 mm at the probes, Fig. 12(c)", n["orbit_disk"], "orbit_disk")
-    measured = axis("E − W ±500 N, measured, Fig. 15(c)", n["sensed_x"], "peak_sensed")
-    east = axis("EAST 0 to 900 N, Fig. 16", n["east"], "east")
+    orbit = make_axis("orbit ±1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], "orbit_ring")
+    drop = make_axis("drop ±1 mm, in the ring, Fig. 10", r0, "drop_span")
+    probes = make_axis("drop ±1 mm, at the probes, Fig. 10", r0 * lever, "drop_span")
+    disk = make_axis("x(t) ±2 mm at the probes, Fig. 12(c)", n["orbit_disk"], "orbit_disk")
+    measured = make_axis("E − W ±500 N, measured, Fig. 15(c)", n["sensed_x"], "peak_sensed")
+    east = make_axis("EAST 0 to 900 N, Fig. 16", n["east"], "east")
 
     radius = next(entry for entry in free_values() if entry.key == "shaft.radius")
 
-    def together(*axes: Axis) -> tuple[float, float]:
+    def intersect(*axes: PaperAxis) -> tuple[float, float]:
         ends = [[round(end, 2) for end in each.allowed_mm] for each in axes]
         return max(low for low, _ in ends), min(high for _, high in ends)
 
@@ -246,6 +246,6 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
         "spread_mm": [radius.at(part) / _PRINTED_RATIO for part in (0.0, 1.0)],
         "ratio": _PRINTED_RATIO,
         "axes": (orbit, drop, probes, disk, measured, east),
-        "simulated": together(orbit, drop, disk, east),
-        "at_probes": together(orbit, probes, disk, east),
+        "simulated": intersect(orbit, drop, disk, east),
+        "at_probes": intersect(orbit, probes, disk, east),
     }

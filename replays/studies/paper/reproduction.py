@@ -15,11 +15,11 @@ from replays.studies.paper.scans.pulse import (
     FORCE_N,
     MEASURED_N,
     SPEED_HZ,
-    Outcome,
     Pulse,
+    PulseRun,
     apply_low_pass,
     pulse_scene,
-    read,
+    read_outcome,
 )
 from replays.studies.paper.scans.spread import column, hypercube
 from rig.channels.orbit import full_spectrum, waterfall
@@ -88,7 +88,7 @@ def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str],
         "magnet_force": magnet_force(whirl),
         "drop_reaction": drop_numbers(drop)["drop_reaction"],
         **_whirl_numbers(whirl),
-        **{f"force_{speed:g}": read(run, at_s=0.02).reaction_x_n for speed, run in speeds.items()},
+        **{f"force_{speed:g}": read_outcome(run, at_s=0.02).reaction_x_n for speed, run in speeds.items()},
     }
     return Reproduction(parameters, drop, whirl, held, speeds, numbers)
 
@@ -166,7 +166,7 @@ def drop_numbers(run: Run, *, bandwidth_hz: float = 4900.0) -> dict[str, float]:
     }
 
 
-def pulse_spread(spread: list[Outcome], slow: list[Outcome], lasting: list[Outcome]) -> dict[str, np.ndarray]:
+def pulse_spread(spread: list[PulseRun], slow: list[PulseRun], lasting: list[PulseRun]) -> dict[str, np.ndarray]:
     """Return numbers of the pulse with all assumed values varied together, by statement, each of shape (n,).
 
     Args:
@@ -177,27 +177,27 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome], lasting: list[Outco
     whirling = [one for one in spread if one.whirls]
     pairs = [(low, high) for low, high in zip(slow, spread, strict=False) if low.whirls and high.whirls]
 
-    def of(name: str, scale: float = 1.0) -> np.ndarray:
+    def values_of(name: str, scale: float = 1.0) -> np.ndarray:
         return scale * column(whirling, name)
 
     return {
         "backward": np.array([float(one.whirls and one.whirl_hz < 0.0) for one in spread]),
-        "roll": of("roll_s", 1e3),
+        "roll": values_of("roll_s", 1e3),
         # Two readings: at the disk, or in the clearance.
-        "orbit_ring": np.concatenate([of("ring_m", 1e3), of("disk_m", 1e3)]),
-        "orbit_disk": of("disk_m", 1e3),
+        "orbit_ring": np.concatenate([values_of("ring_m", 1e3), values_of("disk_m", 1e3)]),
+        "orbit_disk": values_of("disk_m", 1e3),
         "spin_lowest": column(spread, "slowest_hz"),
-        "whirl_hz": of("whirl_hz", -1.0),
-        "whirl_per_spin": np.abs(of("whirl_hz") / of("spin_hz")),
+        "whirl_hz": values_of("whirl_hz", -1.0),
+        "whirl_per_spin": np.abs(values_of("whirl_hz") / values_of("spin_hz")),
         "peak_x": column(spread, "true_peak_x_n"),
         "peak_y": column(spread, "true_peak_y_n"),
         "peak_sensed": np.maximum(column(spread, "peak_x_n"), column(spread, "peak_y_n")),
-        "steady": of("ripple_n", 100.0) / of("normal_n"),
-        "east": of("reaction_x_n"),
+        "steady": values_of("ripple_n", 100.0) / values_of("normal_n"),
+        "east": values_of("reaction_x_n"),
         # A spectral line at the spin requires a long window.
         "imbalance": 100.0 * column([one for one in lasting if one.whirls], "imbalance"),
-        "measured": of("reaction_x_n", 1.0 / MEASURED_N),
-        "bouncing": of("true_peak_x_n") / of("reaction_x_n"),
+        "measured": values_of("reaction_x_n", 1.0 / MEASURED_N),
+        "bouncing": values_of("true_peak_x_n") / values_of("reaction_x_n"),
         "lasts": np.array([float(one.whirls) for one in lasting]),
         "slowest_whirls": np.array([float(one.whirls) for one in slow]),
         "period_ratio": np.array([low.whirl_hz / high.whirl_hz for low, high in pairs]),
@@ -206,7 +206,7 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome], lasting: list[Outco
 
 
 def _whirl_numbers(run: Run) -> dict[str, float]:
-    truth = read(run, at_s=PULSE_S)
+    truth = read_outcome(run, at_s=PULSE_S)
     last = run.times_s > 0.5 * run.times_s[-1]
     return {
         "orbit_ring": truth.ring_m * 1e3,

@@ -11,7 +11,7 @@ from rig.base.errors import InputError
 from rig.physics.engines import ENGINES
 
 
-def chosen_trials(only: str | None) -> list[str]:
+def select_trials(only: str | None) -> list[str]:
     """Return the trials of a comma-separated list; None selects all.
 
     Raises:
@@ -20,7 +20,7 @@ def chosen_trials(only: str | None) -> list[str]:
     return choose_names("--only", only, list(TRIALS))
 
 
-def chosen_engines(names: str | None) -> list[str]:
+def select_engines(names: str | None) -> list[str]:
     """Return the engines of a comma-separated list; None selects all.
 
     Raises:
@@ -45,12 +45,12 @@ def choose_names(field: str, names: str | None, known: list[str]) -> list[str]:
     """
     if names is None:
         return known
-    asked = [name.strip() for name in names.split(",") if name.strip()]
+    requested = [name.strip() for name in names.split(",") if name.strip()]
     by_lower = {name.lower(): name for name in known}
-    for name in asked:
+    for name in requested:
         if name.lower() not in by_lower:
             raise InputError(field, f"one or more of {', '.join(known)}", name)
-    wanted = {by_lower[name.lower()] for name in asked}
+    wanted = {by_lower[name.lower()] for name in requested}
     if not wanted:
         raise InputError(field, f"one or more of {', '.join(known)}", names)
     return [name for name in known if name in wanted]

@@ -74,9 +74,9 @@ def campaign(
 
 
 def _list() -> None:
-    from replays.campaigns.files.campaign import FOLDER, read_title, shipped
+    from replays.campaigns.files.campaign import FOLDER, find_shipped, read_title
 
-    for name, path in shipped().items():
+    for name, path in find_shipped().items():
         echo(textwrap.fill(f"{name}: {read_title(path)}", 80, subsequent_indent="  "))
     echo(f"files in {FOLDER}")
 
@@ -115,7 +115,7 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
 
     import pytest
 
-    from rig.cli.output.campaign_progress import OUTCOME_WORDS, Progress, bypass_capture
+    from rig.cli.output.campaign_progress import OUTCOME_WORDS, ProgressPlugin, bypass_capture
 
     module = "replays.campaigns.plugin"
     there = any(each.value == module for each in entry_points(group="pytest11"))
@@ -123,7 +123,7 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     # Modules imported before pytest starts do not get rewritten asserts, which is intended.
     plugins += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     with bypass_capture(progress_bar(transient=True)) as bar:
-        progress = Progress(bar)
+        progress = ProgressPlugin(bar)
         status = pytest.main([*plugins, *options, *files], plugins=[progress])
     if progress.is_reader_closed:
         raise BrokenPipeError

@@ -40,7 +40,7 @@ def chart(
     draw: Annotated[bool, typer.Option("--draw", help="Redraw chart.csv of the folder without measuring")] = False,
 ) -> None:
     """Chart speed against error of the rig's engines and other solvers, by phase of the motion and contact law."""
-    from replays.studies.chart.session import Progress, add_solvers, draw_again, make_chart
+    from replays.studies.chart.session import ChartProgress, add_solvers, draw_again, make_chart
     from replays.studies.chart.submission import write_problem
     from replays.studies.common.law_scene import add_law_scene
     from rig.base.errors import InputError, Words
@@ -61,7 +61,7 @@ def chart(
     mode = "full" if full else "quick"
     with reporting(compiles=True) as reporter:
         reporter.show("references")
-        progress = Progress(begin=reporter.begin, step=reporter.step)
+        progress = ChartProgress(begin=reporter.begin, step=reporter.step)
         if add:
             outcome = add_solvers(output, add, progress=progress)
         else:

@@ -41,7 +41,7 @@ def export(
     several files, unless --rate-hz resamples them.
     """
     from recorder.reader import join
-    from replays.recordings.formats.exporting.export import check_output, merged
+    from replays.recordings.formats.exporting.export import check_output, holds_one_table
     from replays.recordings.formats.exporting.export import export as write
     from replays.recordings.formats.exporting.selection import select
     from rig.base.wire import EDGES
@@ -56,7 +56,7 @@ def export(
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
     selection = select(
         recording, channels=split_names(channels), truth=truth, unit=unit, from_s=from_s, to_s=to_s,
-        merged=merged(output),
+        merged=holds_one_table(output),
     )  # fmt: skip
     with reporting() as reporter:
 

@@ -109,11 +109,13 @@ class FitRequest:
         from replays.recordings.resimulation.experiment import Experiment
         from rig.run.scenes import load_scene
 
-        experiment = Experiment.of(recording) if self.scene is None else Experiment(scene=load_scene(self.scene))
+        experiment = (
+            Experiment.from_recording(recording) if self.scene is None else Experiment(scene=load_scene(self.scene))
+        )
         experiment.scene.check_physics()
         if self.parameters is not None:
-            experiment = experiment.changed({"parameters": self.parameters, "set": {}})
-        return experiment if self.engine is None else experiment.changed({"engine.name": self.engine})
+            experiment = experiment.with_changes({"parameters": self.parameters, "set": {}})
+        return experiment if self.engine is None else experiment.with_changes({"engine.name": self.engine})
 
 
 @dataclass(frozen=True)
@@ -167,8 +169,8 @@ def identify(
     Exit status 1, and no set is written, if the model does not explain the recording: then no value is a result.
     """
     from recorder.reader import join
-    from replays.recordings.identification.document import check_set, fitted_set, identification_document, write_set
-    from replays.recordings.identification.summary import report_of
+    from replays.recordings.identification.document import check_set, format_set, identification_document, write_set
+    from replays.recordings.identification.summary import make_report
     from replays.report import check_report, write_report
 
     if output is not None:
@@ -181,9 +183,9 @@ def identify(
         found, along = request.run(recording, search, exact=exact, progress=reporter.step)
     fits = found.judgement.fits
     if output is not None and fits:
-        write_set(fitted_set(found, recording=name), output)
+        write_set(format_set(found, recording=name), output)
     if report is not None:
-        write_report(report_of(found, recording=name, origin=recording_origin(name, recording)), report)
+        write_report(make_report(found, recording=name, origin=recording_origin(name, recording)), report)
     if form.as_json:
         echo_json(identification_document(found, recording=name))
     else:

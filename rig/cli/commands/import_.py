@@ -174,12 +174,12 @@ def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
         where = f"{guess.entry.group} " if len({each.entry.group for each in guesses}) > 1 else ""
         reason = guess.why if guess.channel else "not a channel of the rig; kept as a new channel"
         course = guess.features.sparkline(_SPARK)
-        style = "" if guess.channel and guess.sure != "ask" else "yellow"
+        style = "" if guess.channel and guess.confidence != "ask" else "yellow"
         table.add_row(
             f"{where}{guess.entry.name}{unit}",
             course,
             guess.channel or "-",
-            guess.sure if guess.channel else "-",
+            guess.confidence if guess.channel else "-",
             reason,
             style=style,
         )
@@ -193,7 +193,7 @@ def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
 def _document(guess: Guess) -> dict[str, Any]:
     return {
         "file": guess.source.path.name, "group": guess.entry.group, "signal": guess.entry.name,
-        "unit": guess.entry.unit, "channel": guess.channel or None, "sure": guess.sure if guess.channel else None,
+        "unit": guess.entry.unit, "channel": guess.channel or None, "sure": guess.confidence if guess.channel else None,
         "why": guess.why, "asks": guess.asks, "mean": guess.features.mean, "low": guess.features.extent[0],
         "high": guess.features.extent[1], "rate_hz": guess.features.axis.rate_hz if guess.features.timed else None,
     }  # fmt: skip

@@ -46,7 +46,7 @@ def ladder(
     import json
 
     from replays.studies.ladder.chart import draw
-    from replays.studies.ladder.document import ladder_document, pick_of
+    from replays.studies.ladder.document import ladder_document, make_pick
     from replays.studies.ladder.pick import check_target, write_pick
     from replays.studies.ladder.quantity import parse_quantities
     from replays.studies.ladder.search import search
@@ -77,7 +77,7 @@ def ladder(
         with whole_file(paths[-1]) as draft:
             draft.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     if write is not None:
-        write_pick(write, scene, pick_of(found))
+        write_pick(write, scene, make_pick(found))
     if form.as_json:
         echo_json(document)
         return

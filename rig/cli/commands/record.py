@@ -20,7 +20,7 @@ from rig.run.commands import SUMMARIES
 
 if TYPE_CHECKING:
     from recorder.contents.summary import Progress, Summary
-    from recorder.output.disk_limits import Limits
+    from recorder.output.disk_limits import DiskLimits
     from recorder.output.trigger import Capture
     from recorder.session import RecordingSession
     from rig.serve.transport.zenoh import ZenohClient
@@ -119,17 +119,17 @@ class Disk:
     when_full: Annotated[WhenFull, _disk("At a disk limit: stop, or remove the oldest file")] = WhenFull.STOP
     backlog_mb: Annotated[float, _disk("Memory for data that waits for the disk in MB; more is lost")] = 256.0
 
-    def limits(self, rotation: Rotation) -> Limits:
+    def limits(self, rotation: Rotation) -> DiskLimits:
         """Return the limits of file size and disk space.
 
         Raises:
             InputError: The backlog is out of range.
         """
-        from recorder.output.disk_limits import Limits
+        from recorder.output.disk_limits import DiskLimits
 
         if not 1.0 <= self.backlog_mb <= 1e5:
             raise InputError("backlog_mb", "from 1 to 1e5", self.backlog_mb)
-        return Limits(
+        return DiskLimits(
             rotate_mb=rotation.rotate_mb,
             rotate_s=rotation.rotate_s,
             budget_mb=self.budget_mb,

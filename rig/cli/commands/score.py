@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from replays.recordings.formats.mapping import Mapping
-    from replays.score.card.limits import Limits
+    from replays.score.card.limits import ScoreLimits
     from replays.score.card.scorecard import Scorecard
 
 _live = panel("Live")
@@ -131,7 +131,7 @@ def score(
 
 
 def _judge_live(
-    connection: Connection, for_s: float, limits: Limits, path: Literal["digital", "analogue"] | None,
+    connection: Connection, for_s: float, limits: ScoreLimits, path: Literal["digital", "analogue"] | None,
     channels: list[str] | None, mapping: Mapping | None,
 ) -> Scorecard:  # fmt: skip
     """Collect the lines from stdin and the streams of the rig at the same time, and score them."""

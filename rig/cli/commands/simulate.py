@@ -35,9 +35,9 @@ def simulate(
         check_run_output(output, force=force)
         loaded = load_scene(scene, scene_changes.overrides())
         if check:
-            from replays.studies.check import finer
+            from replays.studies.check import refine
 
-            finer(loaded)  # raises its errors before a long run
+            refine(loaded)  # raises its errors before a long run
 
         from rig.run.simulation import Simulation
 

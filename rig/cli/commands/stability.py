@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from replays.studies.stability.scenes.scene_atlas import Outcome
+    from replays.studies.stability.scenes.scene_atlas import SceneOutcome
     from replays.studies.stability.trials.cell import Cell
 
 
@@ -62,7 +62,7 @@ def stability(
     the same for twelve scenes, from coarse to fine settings, including installed peers unless --engines excludes them
     (12 min). --law adds the hammer scene with that law to the twelve; its name for --only is "law".
     """
-    from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
+    from replays.studies.stability.table import run_trials, select_engines, select_trials
 
     if scenes and (full or random is not None):
         raise InputError("--scenes", "given without --full and --random", "--full" if full else f"--random {random}")
@@ -73,14 +73,14 @@ def stability(
             raise InputError("--law", "given with --scenes", str(law))
         name = add_law_scene(law)
         only = only and ",".join(name if part == "law" else part for part in split_names(only))
-    names = chosen_engines(engines)
+    names = select_engines(engines)
     if scenes:
         _twelve(only, None if engines is None else names, output, form)
         return
     if random is not None:
         _sweep(random, seed, only, names, output, form)
         return
-    trials = chosen_trials(only)
+    trials = select_trials(only)
     cells: list[Cell] = []
     pictures: list[Path] = []
     with reporting(compiles=True) as reporter:
@@ -109,9 +109,9 @@ def stability(
 
 
 def _sweep(count: int, seed: int, only: str | None, engines: list[str], folder: Path | None, form: Form) -> None:
-    from replays.studies.stability.scenes.sweep import chosen_numbers, summary, sweep
+    from replays.studies.stability.scenes.sweep import select_numbers, summary, sweep
 
-    numbers, rows, interrupted = chosen_numbers(only, count), [], False
+    numbers, rows, interrupted = select_numbers(only, count), [], False
     with reporting() as reporter:
         reporter.begin(len(numbers))
         try:
@@ -146,14 +146,14 @@ def _sweep(count: int, seed: int, only: str | None, engines: list[str], folder: 
 def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, form: Form) -> None:
     from replays.studies.common.journal import prepare_folder
     from replays.studies.stability.scenes.scene_atlas import (
-        Outcome,
-        chosen_scenes,
+        SceneOutcome,
         draw_scene_atlas,
         is_silent,
         outcomes,
+        select_scenes,
     )
 
-    names, found, interrupted = chosen_scenes(only), list[Outcome](), False
+    names, found, interrupted = select_scenes(only), list[SceneOutcome](), False
     if folder is not None:
         prepare_folder(folder)
     with reporting(compiles=True) as reporter:
@@ -177,7 +177,7 @@ def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, fo
         raise typer.Exit(1)
 
 
-def scenes_table(found: list[Outcome]) -> Table:
+def scenes_table(found: list[SceneOutcome]) -> Table:
     """Return a table of how often each method had each outcome."""
     from replays.studies.stability.scenes.scene_atlas import OUTCOMES
 

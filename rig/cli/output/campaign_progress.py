@@ -26,7 +26,7 @@ def bypass_capture(bar: Any) -> Any:
 
 
 @dataclass
-class Progress:
+class ProgressPlugin:
     """Plugin of pytest that prints a line per case and updates a live line."""
 
     bar: Any
@@ -75,19 +75,19 @@ class Progress:
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Record the end of a phase of a case; print the case after its last phase."""
-        from replays.campaigns.reporting.results import outcome_of, reason_of
+        from replays.campaigns.reporting.results import find_outcome, find_reason
 
         name = report.nodeid
         outcome = self.outcomes.get(name, "passed")
         if report.failed:
-            outcome = outcome_of(report) if outcome in ("passed", "inconclusive") else "error"
+            outcome = find_outcome(report) if outcome in ("passed", "inconclusive") else "error"
         elif report.skipped:
             outcome = "skipped"
         self.outcomes[name] = outcome
         if outcome != "passed" and name not in self.reasons:
             # A campaign file has a line for each value that fails.
             lines = report.longrepr.splitlines() if isinstance(report.longrepr, str) else ()
-            self.reasons[name] = "\n      ".join([reason_of(report), *map(printable, lines[1:])])
+            self.reasons[name] = "\n      ".join([find_reason(report), *map(printable, lines[1:])])
         if report.when == "teardown":
             self.done.add(name)
             self.running.pop(name, None)

@@ -36,7 +36,7 @@ class Sender(StrictModel):
     name: Name
 
 
-class Report(StrictModel):
+class ClientReport(StrictModel):
     """Report that a client sends twice a second on `rig/clients/NAME`."""
 
     name: Name | None = None
@@ -67,8 +67,8 @@ class Reporter:
         self._secret = secrets.token_hex(16)
 
     def send(self, received_index: int | None, *, lost: int, room: int | None = None, done: bool = False) -> None:
-        """Send a report; arguments as of `Report`."""
-        report = Report(
+        """Send a report; arguments as of `ClientReport`."""
+        report = ClientReport(
             name=self._name, received_index=received_index, lost=lost, room=room, done=done, secret=self._secret
         )
         self._client.report(f"{wire.CLIENTS}/{self._name}", report.model_dump_json().encode())
@@ -118,7 +118,7 @@ class Clients:
         """Store a report; on a thread of the transport."""
         try:
             name = Sender(name=key.rpartition("/")[2]).name
-            report = check(Report, payload, field="report")
+            report = check(ClientReport, payload, field="report")
         except ValueError:
             self.malformed += 1
             return

@@ -223,20 +223,20 @@ class SlcanPort(Outlet):
         """Return whether a command requests the rate of the bus."""
         speed = self._speed
         if command == "S" and re.fullmatch(r"[0-8]", rest):
-            asked, given = _RATES[int(rest)], None if speed is None else speed.nominal_bit_s
+            requested, given = _RATES[int(rest)], None if speed is None else speed.nominal_bit_s
         elif command == "Y" and re.fullmatch(r"[1-9]", rest):
             if speed is not None and not speed.fd:
                 return False
-            asked, given = 1e6 * int(rest), None if speed is None else speed.data_bit_s
+            requested, given = 1e6 * int(rest), None if speed is None else speed.data_bit_s
         elif command == "s" and re.fullmatch(r"[0-9A-Fa-f]{4}", rest):
             # Bus timing registers 0 and 1 of the SJA1000.
             first, second = bytes.fromhex(rest)
             quanta = 1 + (second & 15) + 1 + (second >> 4 & 7) + 1
-            asked = _CLOCK_HZ / (((first & 63) + 1) * quanta)
+            requested = _CLOCK_HZ / (((first & 63) + 1) * quanta)
             given = None if speed is None else speed.nominal_bit_s
         else:
             return False
-        return given is None or abs(asked - given) < 1e-3 * given
+        return given is None or abs(requested - given) < 1e-3 * given
 
     def _transmit(self, line: str) -> bytes | None:
         import can

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from replays.recordings.formats.events.motion import Impact, Motion, detect_impact, estimate_speed
+from replays.recordings.formats.events.motion import ChannelMotion, Impact, detect_impact, estimate_speed
 from rig.base.errors import InputError, Words
 from rig.channels.table import ChannelTable, default_table
 from rig.run.commands.table import HAMMER_BOUNDS
@@ -45,7 +45,7 @@ class Speed(NamedTuple):
         return f"{self.hz:.4g}{within} Hz by {self.by}"
 
 
-def speeds_before(motions: Sequence[Motion], edges: np.ndarray, until_s: float) -> list[Speed]:
+def measure_speeds(motions: Sequence[ChannelMotion], edges: np.ndarray, until_s: float) -> list[Speed]:
     """Return mean speeds up to some time, or of the whole log: from the channel `speed`, from edges, else from probes.
 
     Args:
@@ -85,7 +85,7 @@ def build_experiment(
     pulses: Sequence[HammerPulse],
     *,
     duration_s: float,
-    motions: Sequence[Motion],
+    motions: Sequence[ChannelMotion],
     edges: np.ndarray,
     table: ChannelTable,
     remarks: list[str],
@@ -144,7 +144,7 @@ def build_experiment(
         if hits and all(one.name != "hammer" for one in motions):
             unsure |= _UNRECORDED_PULSE_DEVIATION
             unsure["hammer.1.duration_ms"] *= hits[0].request.model_dump()["duration_ms"]
-    scene, deviation_hz = _apply_speed(scene, wanted, speeds_before(motions, edges, first_s), edges, remarks)
+    scene, deviation_hz = _apply_speed(scene, wanted, measure_speeds(motions, edges, first_s), edges, remarks)
     if deviation_hz:
         unsure["drive.speed_hz"] = deviation_hz
     simulation = Simulation(scene)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from replays.estimate.runs import block_means
-from replays.recordings.formats.clock import Axis
+from replays.recordings.formats.clock import TimeAxis
 from replays.recordings.formats.events.pulses import find_pulses
 from rig.channels.orbit import full_spectrum
 from rig.channels.table import default_table
@@ -35,12 +35,12 @@ _FREQUENCY_DEVIATION = 0.1
 """Standard deviation of a line's frequency, as a fraction of the frequency resolution."""
 
 
-class Motion(NamedTuple):
+class ChannelMotion(NamedTuple):
     """Motion of one channel in its unit, shape (n,); nan for missing samples."""
 
     name: str
     values: np.ndarray
-    axis: Axis
+    axis: TimeAxis
 
     @property
     def kind(self) -> str:
@@ -48,12 +48,12 @@ class Motion(NamedTuple):
         channel = default_table().channels.get(self.name)
         return "" if channel is None or channel.name == "hammer" else channel.unit
 
-    def slow(self) -> tuple[np.ndarray, np.ndarray]:
+    def average_blocks(self) -> tuple[np.ndarray, np.ndarray]:
         """Return times [s] and block means of the motion, each shape (m,)."""
-        gone = ~np.isfinite(self.values)
+        missing = ~np.isfinite(self.values)
         values, rows = self.values, np.arange(len(self.values))
-        if gone.any():  # a channel without finite values does not move
-            values = np.zeros(len(rows)) if gone.all() else np.interp(rows, rows[~gone], values[~gone])
+        if missing.any():  # a channel without finite values does not move
+            values = np.zeros(len(rows)) if missing.all() else np.interp(rows, rows[~missing], values[~missing])
         several = max(1, round(_BLOCK_S * self.axis.rate_hz))
         return block_means(self.axis.instants()[: len(values)], several), block_means(values, several)
 
@@ -67,7 +67,7 @@ class Impact(NamedTuple):
     """Start [s], force [N], length [ms] and direction [degrees]; None without a pair of probes."""
 
 
-def detect_impact(motions: Sequence[Motion]) -> Impact | None:
+def detect_impact(motions: Sequence[ChannelMotion]) -> Impact | None:
     """Return the first sudden motion that several channels show, or None."""
     found = sorted(
         (at_s, one.name)
@@ -81,9 +81,9 @@ def detect_impact(motions: Sequence[Motion]) -> Impact | None:
     return None
 
 
-def _onset_s(motion: Motion) -> float | None:
+def _onset_s(motion: ChannelMotion) -> float | None:
     """Return the time of a channel's first sudden and lasting change of curvature [s]."""
-    times, values = motion.slow()
+    times, values = motion.average_blocks()
     if len(times) < 3:
         return None
     step_s = float(times[-1] - times[0]) / (len(times) - 1)
@@ -93,13 +93,13 @@ def _onset_s(motion: Motion) -> float | None:
     now = bent[rise:]
     for n in np.flatnonzero((now > _MIN_JUMP * before) & (now > _MIN_PART * bent.max(initial=0.0))).tolist():
         later = now[n + math.ceil(_PERSISTENCE_S[0] / step_s) : n + math.ceil(_PERSISTENCE_S[1] / step_s)]
-        seen = len(later) == 0 or later.max() > _MIN_PERSISTENCE * before[n]
-        if seen and lead <= n < len(now) - rise:
+        persists = len(later) == 0 or later.max() > _MIN_PERSISTENCE * before[n]
+        if persists and lead <= n < len(now) - rise:
             return float(times[1 + rise + n])
     return None
 
 
-def _pulse(motions: Mapping[str, Motion], at_s: float) -> tuple[float, float, float, float] | None:
+def _pulse(motions: Mapping[str, ChannelMotion], at_s: float) -> tuple[float, float, float, float] | None:
     """Return the half sine that explains the acceleration of a pair of probes, as found by `pulses.find_pulses`."""
     from scipy.signal import savgol_filter
 
@@ -128,13 +128,13 @@ def _pulse(motions: Mapping[str, Motion], at_s: float) -> tuple[float, float, fl
     first = force[:, (times >= at_s) & (times < at_s + _PARABOLA_S)].sum(axis=1)
     along = first / max(float(np.hypot(*first)), 1e-30) @ force
     least = max(_MIN_JUMP * float(along[quiet].std()), 1e-3)
-    found, _ = find_pulses(along, Axis(float(times[0]), rate_hz, len(along)), HammerMapping(threshold_n=least))
+    found, _ = find_pulses(along, TimeAxis(float(times[0]), rate_hz, len(along)), HammerMapping(threshold_n=least))
     if not found:
         return None
     return found[0].at_s, found[0].force_n, found[0].duration_ms, math.degrees(math.atan2(first[1], first[0]))
 
 
-def estimate_speed(motions: Sequence[Motion], *, until_s: float = math.inf) -> tuple[float, float] | None:
+def estimate_speed(motions: Sequence[ChannelMotion], *, until_s: float = math.inf) -> tuple[float, float] | None:
     """Return the speed of rotation from the probes and its standard deviation [Hz]; None if no line is distinct.
 
     It is the strongest line of the spectrum, which is that of the unbalance unless the shaft is hit. The deviation is a
@@ -147,7 +147,7 @@ def estimate_speed(motions: Sequence[Motion], *, until_s: float = math.inf) -> t
     named = {one.name: one for one in motions if one.kind == "mm" and one.axis.rate_hz >= _MIN_RATE_HZ}
     best: tuple[float, float, float] | None = None
     for place in ("disk", "ring"):
-        parts = [named[name].slow() for name in (f"{place}_x", f"{place}_y") if name in named]
+        parts = [named[name].average_blocks() for name in (f"{place}_x", f"{place}_y") if name in named]
         if not parts or not len(parts[0][0]) or len({len(times) for times, _ in parts}) > 1:
             continue
         times = parts[0][0]

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.estimate.runs import true_runs
+from replays.estimate.runs import find_true_runs
 
 if TYPE_CHECKING:
-    from replays.recordings.formats.clock import Axis
+    from replays.recordings.formats.clock import TimeAxis
     from replays.recordings.formats.mapping import HammerMapping
 
 _FOOT_FRACTION = 0.05
@@ -47,7 +47,9 @@ class HammerPulse:
         }  # fmt: skip
 
 
-def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> tuple[list[HammerPulse], list[HammerPulse]]:
+def find_pulses(
+    force_n: np.ndarray, axis: TimeAxis, wanted: HammerMapping
+) -> tuple[list[HammerPulse], list[HammerPulse]]:
     """Return the hammer pulses in a force that count, and separate ones that follow another too soon.
 
     A pulse is an interval above the threshold. After a pulse, others are ignored for the dead time; without a given
@@ -64,7 +66,7 @@ def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> tuple
     found: list[HammerPulse] = []
     ignored: list[HammerPulse] = []
     next_allowed_s = -math.inf
-    for start, end in true_runs(force >= wanted.threshold_n):
+    for start, end in find_true_runs(force >= wanted.threshold_n):
         at_s = float(times_s[start])
         last = found[-1] if found else None
         soon = last is not None and at_s < next_allowed_s

@@ -85,7 +85,7 @@ def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = ()) -> 
     check_new_file(path, field="output", suffixes=suffixes or written_suffixes(), force=force)
 
 
-def merged(path: Path) -> bool:
+def holds_one_table(path: Path) -> bool:
     """Return whether a format holds one table at one rate."""
     return _writer_class(path).merged
 
@@ -123,7 +123,7 @@ def export(
     kind = _writer_class(path)
     source: Selection = selection
     if rate_hz is not None:
-        source = resampled(selection, rate_hz, method)
+        source = resample(selection, rate_hz, method)
     jobs = [(path, source)]
     if kind.merged and len(source.tables) > 1:
         jobs = [(_rate_path(path, table, source), replace(source, tables=(table,))) for table in source.tables]
@@ -193,7 +193,7 @@ class _Resampled(Selection):
             yield ExportChunk(index=start, times_s=times_s, values=values, present=np.ones(len(values), dtype=bool))
 
 
-def resampled(selection: Selection, rate_hz: float, method: Method) -> Selection:
+def resample(selection: Selection, rate_hz: float, method: Method) -> Selection:
     """Return a selection resampled to one table at one rate, in memory.
 
     Raises:
@@ -211,11 +211,11 @@ def resampled(selection: Selection, rate_hz: float, method: Method) -> Selection
     wanted = first_s + np.arange(rows) / rate_hz
     columns, parts = [], []
     for table in selection.tables:
-        if not selection.whole(table):
+        if not selection.is_complete(table):
             raise InputError("range", "free of missing rows for resampling (set from_s and to_s)",
                              Words(f"{selection.missing[table.name]} missing in {table.name}"))  # fmt: skip
         values = np.concatenate([chunk.values for chunk in selection.chunks(table)])
-        axis = clock.Axis(table.first_s, table.rate_hz, table.rows)
+        axis = clock.TimeAxis(table.first_s, table.rate_hz, table.rows)
         for c, column in enumerate(table.columns):
             if method == "linear":
                 values_c = clock.interpolate_linear(values[:, c], axis, wanted)

@@ -75,7 +75,7 @@ class Column:
             }  # fmt: skip
         return about
 
-    def about(self, sensor: str) -> str:
+    def describe(self, sensor: str) -> str:
         """Return description, sensor and calibration in one line.
 
         Args:
@@ -142,7 +142,7 @@ class ExportTable:
     rows: int
     shift: int
 
-    def exported(self, c: int, chunk: ExportChunk) -> np.ndarray:
+    def convert_column(self, c: int, chunk: ExportChunk) -> np.ndarray:
         """Return a column in the exported unit, float64, shape (n,); nan for missing values."""
         linear = self.columns[c].linear
         values = chunk.values[:, c]
@@ -247,7 +247,7 @@ class Selection:
             reached = max(reached, end)
         return held
 
-    def whole(self, table: ExportTable) -> bool:
+    def is_complete(self, table: ExportTable) -> bool:
         """Return whether every stream of a table has all its rows."""
         return not self.missing[table.name]
 

@@ -44,7 +44,7 @@ class SignalFeatures:
     """
 
     values: np.ndarray
-    axis: clock.Axis
+    axis: clock.TimeAxis
     timed: bool
     missing: int
 
@@ -146,13 +146,13 @@ def compute_features(signal: FileSignal) -> SignalFeatures:
     good = np.isfinite(values)
     rows = len(values)
     timed = signal.times_s is not None or signal.rate_hz is not None
-    axis = clock.Axis(signal.first_s, signal.rate_hz or 1.0, rows)
+    axis = clock.TimeAxis(signal.first_s, signal.rate_hz or 1.0, rows)
     if signal.times_s is not None:
         times_s = signal.times_s[:rows]
         try:
-            axis = clock.axis_of_stamps(times_s, line=False, what="")
+            axis = clock.make_axis(times_s, line=False, what="")
         except InputError:  # reported by the import
-            axis = clock.Axis(0.0, even_rate_hz(times_s) or 1.0, rows)
+            axis = clock.TimeAxis(0.0, even_rate_hz(times_s) or 1.0, rows)
         values, good = axis.place_samples(values), axis.place_samples(np.where(good, 1.0, np.nan)) == 1.0
     mean = float(values[good].mean()) if good.any() else 0.0
     return SignalFeatures(np.where(good, values, mean), axis, timed, int(len(good) - good.sum()))

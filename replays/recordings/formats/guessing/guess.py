@@ -47,7 +47,7 @@ class Guess:
         name_parts: Content of its name.
         kind: Quantity, as in `ParsedName`; empty if unknown.
         channel: Channel of the rig; empty: none.
-        sure: `sure`, `likely` or `ask`; empty without a channel.
+        confidence: `sure`, `likely` or `ask`; empty without a channel.
         reasons: Reasons of the guess.
         unit: Unit that the file lacks or has wrong; None: as in the file.
         sensitivity: Volts per unit, in the notation of a mapping; None for signals in units.
@@ -63,7 +63,7 @@ class Guess:
     name_parts: ParsedName
     kind: str = ""
     channel: str = ""
-    sure: str = ""
+    confidence: str = ""
     reasons: list[str] = field(default_factory=list)
     unit: str | None = None
     sensitivity: str | None = None
@@ -101,10 +101,10 @@ class Guess:
             else 0.0
         )
 
-    def assign(self, channel: str, sure: str, *reasons: str, ask: str = "") -> None:
+    def assign(self, channel: str, confidence: str, *reasons: str, ask: str = "") -> None:
         """Assign a channel with a confidence no higher than before; `ask` is the question about its name."""
         order = ("", SURE, LIKELY, ASK)
-        self.channel, self.sure = channel, max(self.sure, sure, key=order.index)
+        self.channel, self.confidence = channel, max(self.confidence, confidence, key=order.index)
         self.reasons += reasons
         if ask:
             self.asks["name"] = ask
@@ -173,12 +173,12 @@ def _kind(each: Guess) -> str:
     word = f"name: {named.kind_word}" if named.kind_word else ""
     if by_unit == "force" and (named.kind == "hammer" or (view.is_hammer and not named.side)):
         each.reasons += [word] if named.kind == "hammer" else ["rests except for single pulses"]
-        each.sure = SURE if named.kind == "hammer" else LIKELY
+        each.confidence = SURE if named.kind == "hammer" else LIKELY
         return "hammer"
     if by_unit:
         agree = named.kind == by_unit
         each.reasons += [*([word] if agree else []), f"unit {each.entry.unit}"]
-        each.sure = SURE if agree or named.place or named.side else LIKELY
+        each.confidence = SURE if agree or named.place or named.side else LIKELY
         return by_unit
     if units.get_quantity(each.entry.unit) not in ("", "voltage", "number"):
         return ""
@@ -187,22 +187,22 @@ def _kind(each: Guess) -> str:
     pulses = view.edges if not kind else view.pulses if len(view.pulses) > 1 or kind == "keyphasor" else ()
     if len(pulses) and kind in ("", "speed", "keyphasor"):
         each.reasons += [word, f"{len(pulses)} {'even ' * bool(len(view.edges))}pulses"]
-        each.sure = SURE if kind else LIKELY
+        each.confidence = SURE if kind else LIKELY
         return "keyphasor"
     if kind == "keyphasor":
         return ""  # no pulses
     if kind == "force" and view.is_hammer and not named.side:
         kind = "hammer"
     if not kind and each.volts and named.place in _PAIRS["length"] and named.axis:
-        each.sure = SURE
+        each.confidence = SURE
         return "length"
     if not kind and each.volts and _PROBE_V[0] < view.mean < _PROBE_V[1] and view.spread < 0.3 * abs(view.mean):
         each.reasons.append(f"rests at {view.mean:.3g} V, as a probe does")
-        each.sure = LIKELY
+        each.confidence = LIKELY
         return "length"
     if kind:
         each.reasons.append(word)
-        each.sure = SURE if each.volts else LIKELY
+        each.confidence = SURE if each.volts else LIKELY
     return kind
 
 
@@ -235,10 +235,10 @@ def _assign_pairs(kind: str, found: list[Guess], assigned: set[str]) -> None:
     for number, pair in enumerate(pairs):
         if pair[0].name_parts.place in set(open_places) - set(named.values()):
             named[number] = pair[0].name_parts.place
-    places, why, sure = _places(kind, pairs, named, open_places)
+    places, why, confidence = _places(kind, pairs, named, open_places)
     for number, pair in enumerate(pairs):
         place = places[number]
-        ask = [f"{' or '.join(_PAIRS[kind])}"] if number not in named and sure == ASK else []
+        ask = [f"{' or '.join(_PAIRS[kind])}"] if number not in named and confidence == ASK else []
         own_axes = {each.name_parts.axis for each in pair} in ({"x", "y"}, {"x"}, {"y"}) and len(pair) == len(
             {each.name_parts.axis for each in pair}
         )
@@ -251,7 +251,7 @@ def _assign_pairs(kind: str, found: list[Guess], assigned: set[str]) -> None:
                 other = pair[1 - pair.index(each)].entry.name
                 reasons.append(f"90° from {other} at {turned.hz:.3g} Hz")
             reasons += [f"name: {own}"] * bool(own)
-            level = ASK if not own else sure if number not in named else ""
+            level = ASK if not own else confidence if number not in named else ""
             each.assign(f"{place}_{own or axis}", level, *reasons, ask="; ".join(ask) if each is pair[0] else "")
             assigned.add(each.channel)
 
@@ -312,7 +312,7 @@ def _assign_forces(found: list[Guess], guesses: Sequence[Guess], assigned: set[s
     """Assign force transducers: sides by name, else opposite pairs by their correlation."""
     others = {each.name_parts.side for each in found}
     for each in found:
-        name = f"P_{each.name_parts.side_among(others)}"
+        name = f"P_{each.name_parts.resolve_side(others)}"
         if each.name_parts.side and name not in assigned:
             alone = len(others - {""}) == 1 and each.name_parts.side_letter
             each.assign(name, LIKELY if alone else "", f"name: {name[-1]}", *_opposite(each, found))

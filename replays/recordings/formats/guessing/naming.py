@@ -68,7 +68,7 @@ class ParsedName:
     side: str = ""
     side_letter: bool = False
 
-    def side_among(self, others: set[str]) -> str:
+    def resolve_side(self, others: set[str]) -> str:
         """Return the side; the sides of the other forces resolve `O`."""
         if self.side != "O":
             return self.side

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from replays.recordings.formats.guessing.guess import Guess
-from replays.report.canvas import BLACK, BLUE, RED, house_style, label_of, new_figure, save
+from replays.report.canvas import BLACK, BLUE, RED, axis_label, house_style, new_figure, save
 
 _ROW_HEIGHT = 1.15
 """Height of a row [inch]."""
@@ -36,7 +36,7 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
     end_s = max(guess.features.axis.last_s for guess in shown) - zero_s
     for (whole, close), guess in zip(axes, shown, strict=True):
         times, values = guess.features.axis.instants() - zero_s, guess.features.values
-        colour = _COLOURS.get(guess.sure, BLACK)
+        colour = _COLOURS.get(guess.confidence, BLACK)
         whole.plot(*reduce_samples(times, values), color=colour, lw=0.9)
         length = min(len(values), max(_MIN_DETAIL_SAMPLES, round(_DETAIL_S * guess.features.axis.rate_hz)))
         starts = np.arange(0, len(values) - length + 1, max(1, length // 2))
@@ -45,8 +45,8 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
         )
         part = slice(start, start + length)
         close.plot(times[part], values[part], color=colour, lw=0.9)
-        taken = f"{guess.channel} ({guess.sure})" if guess.channel else "a channel of its own"
-        whole.set_title(f"{label_of(guess.entry.name, guess.entry.unit or 'no unit')} \N{RIGHTWARDS ARROW} {taken}")
+        target = f"{guess.channel} ({guess.confidence})" if guess.channel else "a channel of its own"
+        whole.set_title(f"{axis_label(guess.entry.name, guess.entry.unit or 'no unit')} \N{RIGHTWARDS ARROW} {target}")
         whole.set_xlim(0.0, end_s)
         whole.tick_params(labelbottom=whole is axes[-1, 0])
     for ax in axes[-1]:

@@ -10,8 +10,8 @@ from importlib.resources import files as files_of
 from pathlib import Path
 
 from replays.recordings.formats.events.events import format_command
-from replays.recordings.formats.events.motion import Motion, detect_impact, estimate_speed
-from replays.recordings.formats.guessing.attached import Attached, attached
+from replays.recordings.formats.events.motion import ChannelMotion, detect_impact, estimate_speed
+from replays.recordings.formats.guessing.attachments import Attachments, read_attachments
 from replays.recordings.formats.guessing.guess import SURE, Guess, guess_channels
 from replays.recordings.formats.guessing.noise import estimate_noise
 from replays.recordings.formats.mapping import FileOptions
@@ -45,7 +45,7 @@ def guess_mapping(files: Sequence[Path], options: FileOptions | None = None) -> 
         InputError: A file cannot be read.
     """
     sources = [open_source(path, options or FileOptions()) for path in files]
-    known = {source.path: attached(source) for source in sources}
+    known = {source.path: read_attachments(source) for source in sources}
     exported = {(path, name) for path, each in known.items() for name in each.channels}
     guesses = guess_channels(sources, exported=lambda source, entry: (source.path, entry.name) in exported)
     return _text(sources, known, guesses), guesses
@@ -56,7 +56,7 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
     return guess_mapping(files, options)[0]
 
 
-def _text(sources: Sequence[Source], known: dict[Path, Attached], guesses: Sequence[Guess]) -> str:
+def _text(sources: Sequence[Source], known: dict[Path, Attachments], guesses: Sequence[Guess]) -> str:
     lines = [
         f"# Mapping for `rig import {' '.join(_quoted(path.name) for path in known)} -m THIS.toml -o OUT.mcap`;",
         "# value = sign * factor * (source - bias), in the channel's unit; + is EAST, up, compression. It can be",
@@ -97,7 +97,7 @@ def _text(sources: Sequence[Source], known: dict[Path, Attached], guesses: Seque
     for table in _TABLES:
         if any(line.startswith(table) for line in lines):
             continue
-        lines += ["#", *(f"# {line}" for line in _example_of(table, guesses))]
+        lines += ["#", *(f"# {line}" for line in _example_table(table, guesses))]
     return "\n".join(lines) + "\n"
 
 
@@ -128,7 +128,7 @@ def _time(guesses: Sequence[Guess]) -> list[str]:
     return ["", comment, "[time]", f'stamps = "line"    # {note}']
 
 
-def _filters(guesses: Sequence[Guess], known: dict[Path, Attached]) -> tuple[list[str], float]:
+def _filters(guesses: Sequence[Guess], known: dict[Path, Attachments]) -> tuple[list[str], float]:
     """Return the lines on the low-pass filters, and the corner seen in the noise [Hz], else 0."""
     open_ones = [each for each in guesses if each.channel and each.entry.name not in known[each.source.path].channels]
     if not open_ones:
@@ -183,7 +183,7 @@ def example() -> str:
     return files_of("replays.recordings.formats").joinpath("example.toml").read_text(encoding="utf-8")
 
 
-def _example_of(table: str, guesses: Sequence[Guess]) -> list[str]:
+def _example_table(table: str, guesses: Sequence[Guess]) -> list[str]:
     """Return one table of the example without options at their default, completed from the files."""
     lines = example().splitlines()
     start = next(n for n, line in enumerate(lines) if line.startswith(table))
@@ -219,7 +219,7 @@ def _example_of(table: str, guesses: Sequence[Guess]) -> list[str]:
     return [new_lines.get(line.split(" ")[0], line) for line in kept]
 
 
-def _motions(guesses: Sequence[Guess]) -> tuple[list[Motion], float]:
+def _motions(guesses: Sequence[Guess]) -> tuple[list[ChannelMotion], float]:
     """Return the channels on the recording's time axis, and its start in source time [s]."""
     table = default_table().channels
     known = [each for each in guesses if each.features.timed and each.gain and table[each.channel].unit != "1"]
@@ -229,7 +229,7 @@ def _motions(guesses: Sequence[Guess]) -> tuple[list[Motion], float]:
         first[group] = max(first.get(group, -math.inf), each.features.axis.first_s)
     zero_s = min(first.values(), default=0.0)
     return [
-        Motion(each.channel, each.gain * (each.features.values - each.zero), each.features.axis.shifted(-zero_s))
+        ChannelMotion(each.channel, each.gain * (each.features.values - each.zero), each.features.axis.shift(-zero_s))
         for each in known
     ], zero_s
 
@@ -258,9 +258,9 @@ def _channel(each: Guess, used_names: set[str], *, several: bool) -> list[str]:
         name, number = f"{plain}_{number}", number + 1
     used_names.add(name)
     rate = f"{entry.rate_hz:.9g} Hz" if entry.rate_hz else "no rate"
-    label = f"  {label_of(entry)}".rstrip()
-    note = f"{CHECK}: {each.asks['name']} ({each.why})" if "name" in each.asks else f"{each.sure}: {each.why}"
-    mark = f"    # {note}" if each.channel and each.sure != SURE else ""
+    label = f"  {shorten_label(entry)}".rstrip()
+    note = f"{CHECK}: {each.asks['name']} ({each.why})" if "name" in each.asks else f"{each.confidence}: {each.why}"
+    mark = f"    # {note}" if each.channel and each.confidence != SURE else ""
     lines = [
         f"[channels.{_key(name)}]{mark}",
         f"source = {_quoted(entry.name)}    # {entry.rows} values, {rate}{label}",
@@ -285,7 +285,7 @@ def _channel(each: Guess, used_names: set[str], *, several: bool) -> list[str]:
     return lines
 
 
-def label_of(entry: Entry) -> str:
+def shorten_label(entry: Entry) -> str:
     """Return the file's description of a signal, shortened."""
     text = " ".join(entry.label.split())
     return text if len(text) <= _LABEL else f"{text[: _LABEL - 3]}..."

@@ -119,7 +119,7 @@ def numbers(column: Any, base: int = 0) -> np.ndarray:
     return np.array(column)
 
 
-def joined_instants(dates: Any, times_s: Any) -> Any:
+def join_instants(dates: Any, times_s: Any) -> Any:
     """Return a column of instants: dates at midnight plus times of day [s]."""
     import pyarrow
 
@@ -217,7 +217,7 @@ class ParquetWriter(export.FormatWriter):
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Write rows; those that no stream has are left out."""
-        values = [table.exported(c, chunk)[chunk.present] for c in range(len(table.columns))]
+        values = [table.convert_column(c, chunk)[chunk.present] for c in range(len(table.columns))]
         self._file.write([chunk.times_s[chunk.present], *values])
 
 

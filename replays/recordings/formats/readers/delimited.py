@@ -13,7 +13,7 @@ import numpy as np
 
 from replays.recordings.formats.readers import columnar
 from replays.recordings.formats.readers.dialect import MISSING, Layout, find_layout, instant, time_column
-from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, read_error
 from replays.recordings.resimulation.background import Background
 from rig.base.errors import InputError, Words
 from rig.base.text import printable
@@ -42,17 +42,17 @@ def look_into(path: Path, options: FileOptions) -> Source:
     names = list(layout.names)
     stamps = None if layout.empty_first else time_column(names, options.time_column, path=path)
     if stamps is None and options.time_column is None and not layout.empty_first:
-        stamps = _column_of_instants(path, layout, options)
+        stamps = _find_datetime_column(path, layout, options)
     start, base, rows, ends_s = layout.start, 0, 0, []
     unit, scale = "", 1.0
     first = _first_fields(path, layout)
     stamps, date = (None, None) if options.time_column == "none" else _date_and_time(layout, first, stamps)
     if stamps is not None and layout.dialect.is_number(first[stamps]) and not options.time_format:
         missing = first[stamps] in ("", *MISSING, *options.missing)
-        number = "nan" if missing else layout.dialect.plain(first[stamps]).replace(layout.dialect.decimal, ".")
+        number = "nan" if missing else layout.dialect.normalise(first[stamps]).replace(layout.dialect.decimal, ".")
         unit, scale = options.time_in_s(names[stamps], layout.units[stamps], float(number))
     kept: list[list[Any]] | None = []
-    for part in _parsed(path, layout, options, stamps, date):
+    for part in _parse_columns(path, layout, options, stamps, date):
         if stamps is not None:
             if not rows:
                 start, base = start or columnar.first_instant(part[stamps]), columnar.base_ns(part[stamps])
@@ -70,7 +70,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     entries = tuple(Entry(name, "", layout.units[c], rows, rate, c) for c, name in kept_names)
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
-        for part in _parsed(path, layout, options, stamps, date) if kept is None else kept:
+        for part in _parse_columns(path, layout, options, stamps, date) if kept is None else kept:
             part_s = None if stamps is None else columnar.numbers(part[stamps], base) * scale
             yield [signal(columnar.numbers(part[entry.place]), part_s) for entry in entries]
 
@@ -79,7 +79,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
     @cache
     def columns() -> list[np.ndarray]:
-        parts = zip(*(_parsed(path, layout, options, stamps, date) if kept is None else kept), strict=True)
+        parts = zip(*(_parse_columns(path, layout, options, stamps, date) if kept is None else kept), strict=True)
         return [np.concatenate([columnar.numbers(each, base) for each in column]) for column in parts]
 
     @cache
@@ -92,7 +92,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     dialect, remarks = layout.dialect, layout.remarks
     last = dialect.fields(_last_line(path, layout.encoding))
     if not layout.ragged and len(last) < layout.width:
-        remarks += (f"the last line is cut and was ignored: {len(last)} of {layout.width} columns",)
+        remarks += (f"{Source.CUT_LAST_LINE}: {len(last)} of {layout.width} columns",)
     dialect_options: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
     dialect_options |= {"thousands": dialect.thousands} if dialect.thousands else {}
     dialect_options["first_line"] = layout.first + 1
@@ -108,7 +108,7 @@ def _first_fields(path: Path, layout: Layout) -> list[str]:
         return layout.dialect.fields([file.readline() for _ in range(layout.first + 1)][layout.first])
 
 
-def _column_of_instants(path: Path, layout: Layout, options: FileOptions) -> int | None:
+def _find_datetime_column(path: Path, layout: Layout, options: FileOptions) -> int | None:
     """Return the column that has dates and times instead of numbers, whatever its name."""
     for c, text in enumerate(_first_fields(path, layout)[: len(layout.names)]):
         if not layout.dialect.is_number(text) and instant(text, options.time_format) is not None:
@@ -126,7 +126,7 @@ def _date_and_time(layout: Layout, first: Sequence[str], stamps: int | None) -> 
     return (stamps if stamps in times else times[0]), dates[0]
 
 
-def _parsed(
+def _parse_columns(
     path: Path, layout: Layout, options: FileOptions, stamps: int | None, date: int | None
 ) -> Iterator[list[Any]]:
     """Yield pieces of the columns from pyarrow; times of day with a column of dates become instants.
@@ -170,12 +170,12 @@ def _parsed(
             if stamps is not None and pyarrow.types.is_string(columns[stamps].type):
                 columns[stamps] = _instants(path, columns[stamps], options)
             if stamps is not None and date is not None:
-                columns[stamps] = columnar.joined_instants(columns[date], columns[stamps])
+                columns[stamps] = columnar.join_instants(columns[date], columns[stamps])
                 columns[date] = pyarrow.nulls(len(batch), pyarrow.float64())
             if len(batch):
                 yield columns
     except pyarrow.ArrowInvalid as error:
-        raise damaged(path, "text", error) from None
+        raise read_error(path, "text", error) from None
     cut = len(bad) == 1 and bad[0].actual_columns < layout.width
     if bad and not (cut and bad[0].text.strip() == _last_line(path, layout.encoding)):
         row = bad[0]
@@ -200,7 +200,7 @@ def _body(path: Path, layout: Layout) -> tuple[Any, int, str]:
         return str(path), layout.first, layout.encoding.replace("-sig", "")
     mended = []
     for line in path.read_text(encoding=layout.encoding).splitlines()[layout.first :]:
-        fields = [dialect.plain(text) if dialect.is_number(text) else text for text in dialect.fields(line)]
+        fields = [dialect.normalise(text) if dialect.is_number(text) else text for text in dialect.fields(line)]
         if layout.ragged and not any(fields[layout.width :]):
             fields = (fields + [""] * layout.width)[: layout.width] if any(fields) else fields
         mended.append(dialect.delimiter.join(fields))

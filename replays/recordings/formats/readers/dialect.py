@@ -46,7 +46,7 @@ class Dialect:
             return [text.strip() for text in next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True))]
         return [text.strip() for text in line.split(self.delimiter)]
 
-    def plain(self, text: str) -> str:
+    def normalise(self, text: str) -> str:
         """Return a number without digit separators."""
         return re.sub(r"\s", "", text) if self.thousands == " " else text.replace(self.thousands or "\0", "")
 
@@ -56,7 +56,7 @@ class Dialect:
             return True
         if self.thousands:
             group = r"\s" if self.thousands == " " else re.escape(self.thousands)
-            text = self.plain(text) if re.match(rf"[-+]?\d{{1,3}}({group}\d{{3}})+(?!\d)", text) else text
+            text = self.normalise(text) if re.match(rf"[-+]?\d{{1,3}}({group}\d{{3}})+(?!\d)", text) else text
         if self.decimal != "." and "." in text:
             return False
         try:

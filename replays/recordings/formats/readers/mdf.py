@@ -15,7 +15,15 @@ from weakref import finalize
 import numpy as np
 
 from replays.recordings.formats.exporting import export
-from replays.recordings.formats.source import DOCUMENTS, Entry, FileSignal, Source, damaged, even_rate_hz, library
+from replays.recordings.formats.source import (
+    DOCUMENTS,
+    Entry,
+    FileSignal,
+    Source,
+    even_rate_hz,
+    load_library,
+    read_error,
+)
 from rig.base import units
 from rig.base.checks import open_file
 
@@ -41,7 +49,7 @@ _IDENTITY, _LINEAR = 0, 1
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _suppress_output() -> Iterator[None]:
     """Suppress deprecation warnings inside asammdf, numpy and pandas, and asammdf's prints on slow reading."""
     with warnings.catch_warnings(), redirect_stdout(StringIO()):
         for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
@@ -56,31 +64,31 @@ def look_into(path: Path, options: FileOptions) -> Source:
         InputError: The file is not MDF, or asammdf is missing.
     """
     mdf = _open(path)
-    with _quiet():
+    with _suppress_output():
         entries, texts = _entries(mdf)
 
     def read(entry: Entry) -> FileSignal:
-        with _quiet():
+        with _suppress_output():
             return _signal(mdf, *entry.place)
 
     def pieces(signals: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         group = signals[0].group_number
-        if not _plain(mdf, group):
+        if not _has_own_stamps(mdf, group):
             yield [read(entry) for entry in signals]
             return
-        second, master = _second(mdf, group), mdf.masters_db[group]
-        kinds = [_linear(mdf, *entry.place) for entry in signals]
+        second, master = _time_unit_s(mdf, group), mdf.masters_db[group]
+        kinds = [_find_scale(mdf, *entry.place) for entry in signals]
         columns = [(master, None), *zip((entry.place[1] for entry in signals), kinds, strict=True)]
         streams: list[Iterator[Any]] = [
             mdf.iter_get(group=group, index=index, samples_only=True, raw=kind is not None) for index, kind in columns
         ]
         while True:
-            with _quiet():
+            with _suppress_output():
                 found = [next(stream, ()) for stream in streams]
             if not found[0]:
                 return
             times_s = None if second is None else np.asarray(found[0][0], dtype=float) * second
-            yield [_of_records(part, kind, times_s) for part, kind in zip(found[1:], kinds, strict=True)]
+            yield [_from_records(part, kind, times_s) for part, kind in zip(found[1:], kinds, strict=True)]
 
     remarks = (f"{texts} non-numeric channels ignored",) if texts else ()
     about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
@@ -101,11 +109,11 @@ def _documents(mdf: Any) -> dict[str, str]:
 
 
 def _open(path: Path) -> Any:
-    asammdf = library("MDF", "asammdf")
+    asammdf = load_library("MDF", "asammdf")
     file = open_file(path)
     finished = file.read(_HEAD)[-_FLAGS:] == bytes(_FLAGS)
     try:
-        with _quiet():
+        with _suppress_output():
             # Given a path, asammdf maps the whole file into memory, and repairs a copy of an unfinished one.
             mdf = asammdf.MDF(file if finished else path)
             mdf.configure(read_fragment_size=_PIECE)
@@ -120,7 +128,7 @@ def _open(path: Path) -> Any:
         for frame, _ in walk_tb(error.__traceback__):
             with suppress(Exception):
                 frame.f_locals["self"].close()
-        raise damaged(path, "MDF", error) from None
+        raise read_error(path, "MDF", error) from None
 
 
 def _entries(mdf: Any) -> tuple[list[Entry], int]:
@@ -130,7 +138,7 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
         if not rows:
             continue
         name = str(getattr(group.channel_group, "acq_name", "") or f"group {number}")
-        scale = _second(mdf, number)
+        scale = _time_unit_s(mdf, number)
         ends = [mdf.get_master(number, record_offset=at, record_count=1) for at in (0, rows - 1)]
         rate = None if scale is None else even_rate_hz(np.concatenate(ends) * scale, rows)
         master = mdf.masters_db.get(number)
@@ -147,7 +155,7 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
     return entries, texts
 
 
-def _second(mdf: Any, group: int) -> float | None:
+def _time_unit_s(mdf: Any, group: int) -> float | None:
     """Return the unit of a group's master channel [s]; None if it has none, or is an angle, a length or an index.
 
     The format requires seconds; some programs write other units.
@@ -170,14 +178,14 @@ def _numeric(mdf: Any, group: int, index: int) -> bool:
     return few.ndim == 1 and few.dtype.kind in "iufb"
 
 
-def _plain(mdf: Any, group: int) -> bool:
+def _has_own_stamps(mdf: Any, group: int) -> bool:
     """Return whether the stamps of a group are in its own records, which can then be read in pieces."""
     master, stored = mdf.masters_db.get(group), mdf.groups[group]
     own = not getattr(stored.channel_group, "flags", 0) & _REMOTE_MASTER
     return str(mdf.version) >= "4" and master is not None and own and stored.channels[master].channel_type == _MASTER
 
 
-def _linear(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
+def _find_scale(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
     """Return scale and offset of a channel's integers; None if they are not integers, or not linear."""
     arguments = {"group": group, "index": index, "record_offset": 0, "record_count": 1}
     raw = mdf.get(raw=True, ignore_invalidation_bits=True, **arguments)
@@ -189,13 +197,13 @@ def _linear(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
 
 
 def _signal(mdf: Any, group: int, index: int) -> FileSignal:
-    kind, second = _linear(mdf, group, index), _second(mdf, group)
+    kind, second = _find_scale(mdf, group, index), _time_unit_s(mdf, group)
     found = mdf.get(group=group, index=index, raw=kind is not None, ignore_invalidation_bits=True)
     times_s = None if second is None else np.asarray(found.timestamps, dtype=float) * second
-    return _of_records((found.samples, found.invalidation_bits), kind, times_s)
+    return _from_records((found.samples, found.invalidation_bits), kind, times_s)
 
 
-def _of_records(record: Sequence[Any], linear: tuple[float, float] | None, times_s: np.ndarray | None) -> FileSignal:
+def _from_records(record: Sequence[Any], linear: tuple[float, float] | None, times_s: np.ndarray | None) -> FileSignal:
     values, invalid = record
     if linear is None:
         values = values.astype(float)
@@ -227,12 +235,12 @@ class MdfWriter(export.FormatWriter):
     sparse = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
-        asammdf = library("MDF", "asammdf")
+        asammdf = load_library("MDF", "asammdf")
         self._path = path
         self._selection = selection
         self._signal = asammdf.Signal
         self._groups: dict[str, int] = {}
-        with _quiet():
+        with _suppress_output():
             self._file = asammdf.MDF(version="4.10")
             self._file.header.start_time = selection.start
             self._file.header.description = selection.summary()
@@ -248,7 +256,7 @@ class MdfWriter(export.FormatWriter):
         if not len(times_s):
             return
         columns: Sequence[np.ndarray] = [table.raw(c, chunk)[present] for c in range(len(table.columns))]
-        with _quiet():
+        with _suppress_output():
             if table.name in self._groups:
                 pairs = [(times_s, None), *((values, None) for values in columns)]
                 self._file.extend(self._groups[table.name], pairs)
@@ -256,7 +264,7 @@ class MdfWriter(export.FormatWriter):
             signals = [
                 self._signal(
                     samples=values, timestamps=times_s, name=column.name, unit=column.unit,
-                    comment=column.about(table.title),
+                    comment=column.describe(table.title),
                     conversion=None if column.linear is None else dict(zip("ab", column.linear, strict=True)),
                 )
                 for column, values in zip(table.columns, columns, strict=True)
@@ -267,11 +275,11 @@ class MdfWriter(export.FormatWriter):
     def close(self) -> None:
         """Write the file."""
         # Given a path, asammdf would change the suffix.
-        with _quiet(), self._path.open("wb+") as file:
+        with _suppress_output(), self._path.open("wb+") as file:
             self._file.save(file)
             self._file.close()
 
     def abandon(self) -> None:
         """Release the file."""
-        with _quiet():
+        with _suppress_output():
             self._file.close()

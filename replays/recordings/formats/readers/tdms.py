@@ -14,7 +14,7 @@ import numpy as np
 
 from replays.recordings.formats.exporting import export
 from replays.recordings.formats.readers.dialect import is_time
-from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz, library
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, load_library, read_error
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.selection import ExportChunk, ExportTable, Selection
@@ -27,7 +27,7 @@ _RAW_INPUT = 0xFFFFFFFF
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _suppress_output() -> Iterator[None]:
     """Suppress the lines that npTDMS prints for a truncated file, which is reported once as an error."""
     handler = logging.getLogger("nptdms.reader").handlers
     level = [one.level for one in handler]
@@ -46,8 +46,8 @@ def look_into(path: Path, options: FileOptions) -> Source:
     Raises:
         InputError: The file is not TDMS or is truncated, or npTDMS is missing.
     """
-    nptdms = library("TDMS", "npTDMS", "nptdms")
-    with _quiet():
+    nptdms = load_library("TDMS", "npTDMS", "nptdms")
+    with _suppress_output():
         file = nptdms.TdmsFile.read_metadata(path)
     groups = [(group.name, group.channels()) for group in file.groups()]
     starts = [
@@ -58,7 +58,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     ]
     start = min(starts) if starts else None
     if file.file_status.incomplete_final_segment:
-        raise damaged(path, "TDMS", "it is truncated")
+        raise read_error(path, "TDMS", "it is truncated")
     entries, texts = [], 0
     for number, (name, channels) in enumerate(groups):
         for channel in channels:
@@ -132,7 +132,7 @@ class TdmsWriter(export.FormatWriter):
     """
 
     def __init__(self, path: Path, selection: Selection) -> None:
-        nptdms = library("TDMS", "npTDMS", "nptdms")
+        nptdms = load_library("TDMS", "npTDMS", "nptdms")
         self._api = nptdms
         self._selection = selection
         self._file = nptdms.TdmsWriter(path)
@@ -150,8 +150,8 @@ class TdmsWriter(export.FormatWriter):
         objects.append(api.GroupObject(table.name, {"description": table.title} if new else {}))
         for c, column in enumerate(table.columns):
             # Missing rows must be known before the first write, as counts have no nan.
-            counts = column.source is not None and self._selection.whole(table)
-            values = table.raw(c, chunk) if counts else table.exported(c, chunk)
+            counts = column.source is not None and self._selection.is_complete(table)
+            values = table.raw(c, chunk) if counts else table.convert_column(c, chunk)
             properties = self._properties(table, c, scaled=counts) if new else {}
             objects.append(api.ChannelObject(table.name, column.name, values, properties))
         self._described.add(table.name)

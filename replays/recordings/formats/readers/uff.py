@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from replays.recordings.formats.exporting import export
-from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, library
+from replays.recordings.formats.source import Entry, FileSignal, Source, load_library, read_error
 from rig.base import units
 from rig.base.checks import open_file
 from rig.base.errors import InputError
@@ -59,9 +59,9 @@ def look_into(path: Path, options: FileOptions) -> Source:
     Raises:
         InputError: The file is not universal, is truncated or has no time history, or pyuff is missing.
     """
-    pyuff = library("UFF", "pyuff")
+    pyuff = load_library("UFF", "pyuff")
     if not _ends(path):
-        raise damaged(path, "universal (UFF)", "it is truncated")
+        raise read_error(path, "universal (UFF)", "it is truncated")
     file = pyuff.UFF(str(path))
     kinds = list(np.atleast_1d(file.get_set_types()).astype(int))
     heads = {n: file.read_sets(n, header_only=True) for n, kind in enumerate(kinds) if kind == 58}
@@ -147,17 +147,19 @@ def degrees_of_freedom(recording: Recording) -> dict[str, DegreeOfFreedom]:
     directions = {str(event.get("direction")) for event in recording.events if event["event"] == "hammer"}
     found: dict[str, tuple[str, int]] = {}
     for channel in recording.table.channels.values():
-        found[channel.name] = _placed(channel.name, 6 if units.get_quantity(channel.unit) == "speed of rotation" else 0)
+        found[channel.name] = _node_of(
+            channel.name, 6 if units.get_quantity(channel.unit) == "speed of rotation" else 0
+        )
     if "hammer" in found:
         found["hammer"] = ("disk", _IMPACT_DIRECTIONS.get(directions.pop(), 0) if len(directions) == 1 else 0)
     for table, about in recording.catalogue.get("truth", {}).items():
         for column in about["columns"]:
-            found[f"truth.{table}.{column['name']}"] = _placed(column["name"], 0)
+            found[f"truth.{table}.{column['name']}"] = _node_of(column["name"], 0)
     nodes = {place: number for number, place in enumerate(dict.fromkeys(place for place, _ in found.values()), 1)}
     return {name: DegreeOfFreedom(nodes[place], direction, place) for name, (place, direction) in found.items()}
 
 
-def _placed(name: str, otherwise: int) -> tuple[str, int]:
+def _node_of(name: str, otherwise: int) -> tuple[str, int]:
     """Return place and direction from a name; one without an axis is a separate place."""
     if (side := _SIDE.fullmatch(name)) is not None:
         return name, _DIRECTIONS[side[1]]
@@ -186,7 +188,7 @@ class UffWriter(export.FormatWriter):
         """Write rows; missing ones are nan, as the format has no times."""
         for c, at in enumerate(self._at[table.name]):
             self._file.seek(at + 8 * chunk.index)
-            self._file.write(table.exported(c, chunk).astype("<f8").tobytes())
+            self._file.write(table.convert_column(c, chunk).astype("<f8").tobytes())
 
 
 def _header(table: ExportTable, column: Column, selection: Selection, at: DegreeOfFreedom) -> bytes:
@@ -206,7 +208,7 @@ def _header(table: ExportTable, column: Column, selection: Selection, at: Degree
         *(f"{_ascii(text, 80):<80}" for text in texts),
         f"{1:5d}{0:10d}{0:5d}{0:10d} {_ascii(column.name, 10):<10}{at.node:10d}{at.direction:4d}"
         f" {'NONE':<10}{0:10d}{0:4d}",
-        f"{4:10d}{table.rows:10d}{1:10d}{_real(table.first_s):>13}{_real(1.0 / table.rate_hz):>13}{0.0:13.5E}",
+        f"{4:10d}{table.rows:10d}{1:10d}{_e_format(table.first_s):>13}{_e_format(1.0 / table.rate_hz):>13}{0.0:13.5E}",
         f"{_TIME:10d}{0:5d}{0:5d}{0:5d} {'Time':<20} {'s':<20}",
         f"{kind:10d}{length:5d}{force:5d}{0:5d} {_ascii(column.name, 20):<20} {_ascii(column.unit, 20):<20}",
         *(f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':<20} {'NONE':<20}" for _ in range(2)),
@@ -214,7 +216,7 @@ def _header(table: ExportTable, column: Column, selection: Selection, at: Degree
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
-def _real(value: float) -> str:
+def _e_format(value: float) -> str:
     """Return a number with the most digits that fit a field of 13 columns after a blank."""
     return next(text for digits in range(12, 0, -1) if len(text := f"{value:#.{digits}G}") < 13)
 

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat
 
 from replays.recordings.formats.exporting import export
-from replays.recordings.formats.source import Entry, FileSignal, Source, library
+from replays.recordings.formats.source import Entry, FileSignal, Source, load_library
 from rig.base.checks import DOCUMENT_BYTES, check
 from rig.base.errors import InputError, Words
 
@@ -33,7 +33,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     Raises:
         InputError: The file is not WAV, or soundfile is missing.
     """
-    soundfile = library("WAV", "soundfile")
+    soundfile = load_library("WAV", "soundfile")
     with soundfile.SoundFile(path) as file:
         rate, channels, rows, subtype = file.samplerate, file.channels, file.frames, file.subtype
         comment = file.copy_metadata().get("comment", "")
@@ -108,13 +108,13 @@ class WavWriter(export.FormatWriter):
     sidecar = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
-        soundfile = library("WAV", "soundfile")
+        soundfile = load_library("WAV", "soundfile")
         table = selection.tables[0]
         if not float(table.rate_hz).is_integer():
             raise InputError("rate_hz", "a whole number for a WAV file", table.rate_hz)
         if len(table.columns) > 1024:
             raise InputError("channels", "at most 1024 in a WAV file", len(table.columns))
-        if not selection.whole(table):
+        if not selection.is_complete(table):
             raise InputError(
                 "range", "free of missing rows for a WAV file (set from_s and to_s)", Words("one with gaps")
             )

@@ -15,10 +15,10 @@ import numpy as np
 
 from replays.estimate.least_squares import Fit, fit
 from replays.recordings.identification.nuisance import Tuned
-from replays.recordings.identification.request import unit_of
+from replays.recordings.identification.request import fit_unit
 from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict
-from replays.recordings.resimulation.sensitivity import scale_of, value_of, with_values
+from replays.recordings.resimulation.sensitivity import get_scale, get_value, with_values
 from replays.recordings.validation.criteria import Attribution, Candidate
 from replays.recordings.validation.explanations.channel_fit import MARGIN
 from replays.recordings.validation.explanations.explanation import (
@@ -265,14 +265,14 @@ class _CandidateFit:
         self.candidate = candidate
         self.ended = np.zeros(1) if cause is None else np.append(0.0, cause.ended[0])
         self._begin = self.ended
-        self._start = {key: value_of(experiment, key) for key in candidate.keys}
+        self._start = {key: get_value(experiment, key) for key in candidate.keys}
         # A relative change of 0 has no effect: such a value changes in its unit.
         self._absolute = bool(candidate.unit) or 0.0 in self._start.values()
-        self._unit = candidate.unit or (unit_of(candidate.keys[0]) if self._absolute else "")
+        self._unit = candidate.unit or (fit_unit(candidate.keys[0]) if self._absolute else "")
         self._scale = {} if self._absolute else self._start
         self.step = candidate.step
         if candidate.unit and candidate.step == Candidate.model_fields["step"].default:
-            self.step *= scale_of(experiment, candidate.keys[0])
+            self.step *= get_scale(experiment, candidate.keys[0])
 
     def format_value(self, p: float) -> str:
         """Return a value of the candidate's number as text."""

@@ -13,13 +13,7 @@ import numpy as np
 from replays.estimate.least_squares import fit
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.explanations.channel_fit import MARGIN, MIN_ROWS, OUTLIER, Shown, gain_words
-from replays.recordings.validation.explanations.explanation import (
-    Explanation,
-    excess,
-    is_noise,
-    smooth_columns,
-    vector,
-)
+from replays.recordings.validation.explanations.explanation import Explanation, excess, is_noise, smooth_columns, vector
 from replays.recordings.validation.explanations.laws import law_of
 from replays.recordings.validation.trajectory import floors
 from rig.channels.faults.defects import DEFECTS, size_text
@@ -62,7 +56,7 @@ def sensor_faults(
         from_s = _find_onset_s(parts, nominal, from_s, end_s)
     shown = []
     for name, part in parts.items():
-        rows = slice(part.rows_until(from_s), part.rows_until(end_s))
+        rows = slice(part.count_rows(from_s), part.count_rows(end_s))
         expected, *shown_too = (one.values[name][rows] for one in (nominal, *others))
         floor = floors(part, expected, shown_too)
         shown += [
@@ -129,7 +123,7 @@ def _find_onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float
     """Return the start of a fault, after the settling of filters if enough rows remain [s]."""
     onsets = [end_s]
     for name, part in parts.items():
-        rows = slice(part.rows_until(from_s), part.rows_until(end_s))
+        rows = slice(part.count_rows(from_s), part.count_rows(end_s))
         z = ((part.values - nominal.values[name][: len(part.values)]) / part.floor)[rows, smooth_columns(part)]
         sums = np.cumsum(np.vstack([np.zeros(z.shape[1]), z]), axis=0)
         lasting = np.abs(sums[MIN_ROWS:] - sums[:-MIN_ROWS]) > _OUTLIER_NOISES * math.sqrt(MIN_ROWS)
@@ -331,9 +325,9 @@ class Clock:
         self._splines = {
             name: CubicSpline(part.times_s, nominal.values[name])
             for name, part in parts.items()
-            if part.rows_until(end_s) > 16 and (np.diff(part.times_s) > 0.0).all()
+            if part.count_rows(end_s) > 16 and (np.diff(part.times_s) > 0.0).all()
         }
-        self._kept = {name: parts[name].until(end_s) for name in self._splines}
+        self._kept = {name: parts[name].select_until(end_s) for name in self._splines}
         self._end_s = end_s
         if self._kept:
             self._first_s = min(float(part.times_s[0]) for part in self._kept.values())

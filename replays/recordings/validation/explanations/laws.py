@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from replays.estimate.runs import true_runs
+from replays.estimate.runs import find_true_runs
 from replays.estimate.spectra import spectrum
 from replays.recordings.validation.explanations.channel_fit import (
     MARGIN,
@@ -304,7 +304,7 @@ def _fit_random(one: Shown) -> Iterator[Law]:
     """Yield random changes: spikes, a loose contact, jitter, noise."""
     e, d = one.expected, one.values - one.expected
     off = np.abs(d) > OUTLIER * one.floor
-    lengths = [end - begin for begin, end in true_runs(off)]
+    lengths = [end - begin for begin, end in find_true_runs(off)]
     if off.any() and off.mean() < _MAX_SPIKE_PART and max(lengths) < 3 and is_noise(one.apart[~off]):
         yield _make_spikes(one, off, one.apart[~off])
         return

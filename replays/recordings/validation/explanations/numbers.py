@@ -9,10 +9,10 @@ import numpy as np
 from replays.estimate.least_squares import solve_normal
 from replays.recordings.identification.agreement import MAX_PRIOR_DEVIATION
 from replays.recordings.identification.nuisance import Tuned
-from replays.recordings.identification.request import first_command_s, unit_of
+from replays.recordings.identification.request import first_command_s, fit_unit
 from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction
-from replays.recordings.resimulation.sensitivity import Predictor, value_of
+from replays.recordings.resimulation.sensitivity import Predictor, get_value
 from replays.recordings.validation.criteria import Attribution, Candidate
 from replays.recordings.validation.explanations.explanation import Explanation, excess, smooth_columns
 from replays.recordings.validation.trajectory import floors
@@ -49,10 +49,10 @@ def numbers_of_the_model(
     along = tuple(tuned.values)
     candidates = [one for one in rules.candidates if _has_numbers(tuned, one) and not set(one.keys) & set(along)]
     keys = (*along, *dict.fromkeys(key for one in candidates for key in one.keys))
-    kept = {name: part.until(end_s) for name, part in parts.items()}
-    predictor = Predictor(tuned.begun, keys, kept, about_s=tuned.about_s)
+    kept = {name: part.select_until(end_s) for name, part in parts.items()}
+    predictor = Predictor(tuned.baseline, keys, kept, about_s=tuned.about_s)
     # The parts are already on the model's clock.
-    at = [0.0 if key.startswith("clock.") else tuned.values.get(key, value_of(tuned.begun, key)) for key in keys]
+    at = [0.0 if key.startswith("clock.") else tuned.values.get(key, get_value(tuned.baseline, key)) for key in keys]
     slopes = predictor.derivatives(at).slopes
     floor = {
         name: floors(
@@ -74,7 +74,7 @@ def numbers_of_the_model(
     far = np.array([one.beyond for one in tuned.fitted])
     found, before = [], excess(z) + float(off[far] @ off[far])
     for one in candidates:
-        relative, sizes = _find_sizes(tuned.begun, one)
+        relative, sizes = _find_sizes(tuned.baseline, one)
         column = sum(size * columns[key] for size, key in zip(sizes, one.keys, strict=True))
         table = np.column_stack([column, *(columns[key] for key in along)])
         square, side = table.T @ table, table.T @ z
@@ -85,7 +85,7 @@ def numbers_of_the_model(
         left, back = z - table @ change, off + change[1:] / deviations
         if abs(change[0]) > one.largest or (np.abs(back) > MAX_PRIOR_DEVIATION).any() or before == 0.0:
             continue
-        unit = "" if relative else one.unit or unit_of(one.keys[0])
+        unit = "" if relative else one.unit or fit_unit(one.keys[0])
         text = f"{100.0 * change[0]:+.3g} %" if relative else f"{change[0]:+.4g} {unit}"
         found.append(
             Explanation.of(
@@ -93,7 +93,7 @@ def numbers_of_the_model(
                 explained=1.0 - (excess(left) + float(back[far] @ back[far])) / before, to_s=end_s,
             )
         )  # fmt: skip
-    hit_s = first_command_s(tuned.begun)
+    hit_s = first_command_s(tuned.baseline)
     if not found and shorten and hit_s < end_s:
         # No candidate keeps the fitted values within their priors: across impacts the linearisation is not valid.
         sooner_s = hit_s + _SHORT_PART * (end_s - hit_s)
@@ -106,18 +106,18 @@ def find_changes(experiment: Experiment, rules: Attribution, one: Explanation) -
     candidate = next(each for each in rules.candidates if each.name == one.name)
     _, sizes = _find_sizes(experiment, candidate)
     pairs = zip(candidate.keys, sizes, strict=True)
-    return {key: value_of(experiment, key) + one.value * size for key, size in pairs}
+    return {key: get_value(experiment, key) + one.value * size for key, size in pairs}
 
 
 def _find_sizes(experiment: Experiment, candidate: Candidate) -> tuple[bool, list[float]]:
     """Return whether a candidate changes its keys in proportion, and the change of each key for a change of 1."""
-    values = [value_of(experiment, key) for key in candidate.keys]
+    values = [get_value(experiment, key) for key in candidate.keys]
     relative = not (candidate.unit or 0.0 in values)
     return relative, values if relative else [1.0] * len(values)
 
 
 def _has_numbers(tuned: Tuned, candidate: Candidate) -> bool:
     try:
-        return all(isinstance(value_of(tuned.begun, key), float) for key in candidate.keys)
+        return all(isinstance(get_value(tuned.baseline, key), float) for key in candidate.keys)
     except InputError:
         return False

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replays.estimate.runs import true_runs
-from replays.recordings.identification.request import measured_noise
+from replays.estimate.runs import find_true_runs
+from replays.recordings.identification.request import measure_noise
 from replays.recordings.resimulation.prediction import Measured
 
 _MIN_FROZEN_ROWS = 8
@@ -55,7 +55,7 @@ class SignalFault(NamedTuple):
 def steady_rows(values: np.ndarray, held: int = _MIN_FROZEN_ROWS) -> np.ndarray:
     """Return whether each row is in a stretch of equal numbers, shape (n,)."""
     found = np.zeros(len(values), dtype=bool)
-    for begin, end in true_runs(np.concatenate([[False], np.diff(values) == 0.0])):
+    for begin, end in find_true_runs(np.concatenate([[False], np.diff(values) == 0.0])):
         if end - begin >= held - 1:
             found[begin - 1 : end] = True
     return found
@@ -70,7 +70,7 @@ def signal_faults(parts: dict[str, Measured]) -> list[SignalFault]:
     found = []
     for part in parts.values():
         found += _find_jumps(part)
-        noises = [measured_noise(part.values[:, c]) for c in range(len(part.channels))]
+        noises = [measure_noise(part.values[:, c]) for c in range(len(part.channels))]
         for c, channel in enumerate(part.channels):
             if channel.signal == "keyphasor":
                 continue  # a pulse is steady, and has rails
@@ -152,12 +152,12 @@ def _find_held_values(name: str, unit: str, times_s: np.ndarray, values: np.ndar
     rails = np.zeros(len(values), dtype=bool)
     for side, level in (("largest", values.max()), ("smallest", values.min())):
         at = steady_rows(np.where(values == level, level, np.arange(len(values)) + level + 1.0), _RAIL_RUN)
-        runs = true_runs(at)
+        runs = find_true_runs(at)
         if at.sum() >= _RAIL_ROWS and (len(runs) > 1 or at.sum() < _MIN_FROZEN_ROWS):
             rails |= at
             text = f"{at.sum()} rows at its {side}, {level:.6g} {unit}, the first at {times_s[runs[0][0]]:.4f} s"
             found.append(SignalFault(name, "clip", *_find_span(times_s, runs), text))
-    runs = true_runs(steady & ~rails)
+    runs = find_true_runs(steady & ~rails)
     if runs:
         begin, end = _find_span(times_s, runs)
         text = f"the same number in {sum(b - a for a, b in runs)} rows, from {begin:.4f} to {end:.4f} s"

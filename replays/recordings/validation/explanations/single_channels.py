@@ -129,7 +129,7 @@ def _bare(
     part: Measured, channel: Channel, again: Callable[[dict[str, Measured]], Prediction], rows: np.ndarray
 ) -> np.ndarray:
     """Return the expected signal of a channel in some rows without its low-pass [its unit]."""
-    alone = part.first(int(rows[-1]) + 1).only([channel.name]).with_corner_factor(_NO_FILTER)
+    alone = part.select_first(int(rows[-1]) + 1).select_channels([channel.name]).with_corner_factor(_NO_FILTER)
     return again({part.group: alone}).values[part.group][rows, 0]
 
 

@@ -171,7 +171,7 @@ def filtered(one: Shown) -> Iterator[Law]:
         return  # too short
 
     def left_by(other: np.ndarray | float) -> np.ndarray:
-        left = one.values - wave.through(other / nominal)[begin:][: len(one.values)]
+        left = one.values - wave.apply_response(other / nominal)[begin:][: len(one.values)]
         left = one.left([one.level], left)[1] if channel.highpass_hz and one.counts is not None else left / one.floor
         known = slice(margin, -round(_ENDS_S / one.period_s))  # the later signal affects the inverse of a filter
         left[: known.start] = left[known.stop :] = rms_of(left[known])
@@ -205,7 +205,7 @@ def _find_wave(one: Shown) -> tuple[int, Spectrum]:
     """Return the first row and the spectrum of the expected signal with its margins, followed by its reverse."""
     times_s, e = one.around or (one.times_s, one.expected)
     round_trip = np.concatenate([e, e[::-1]])
-    return int(np.searchsorted(times_s, one.times_s[0])), Spectrum.of(round_trip, one.period_s)
+    return int(np.searchsorted(times_s, one.times_s[0])), Spectrum.from_samples(round_trip, one.period_s)
 
 
 def ringing(one: Shown) -> Iterator[Law]:
@@ -221,7 +221,7 @@ def ringing(one: Shown) -> Iterator[Law]:
     def left(logs: np.ndarray) -> np.ndarray:
         w, quality = 2.0 * math.pi * math.exp(logs[0]), 0.5 + math.exp(logs[1])
         response = w**2 / (wave.turn**2 + wave.turn * w / quality + w**2)
-        shown = wave.through(response)[begin:][: len(t)]
+        shown = wave.apply_response(response)[begin:][: len(t)]
         fading, angle = np.exp(-0.5 * w / quality * t), w * math.sqrt(1.0 - 0.25 / quality**2) * t
         return one.left([fading * np.cos(angle), fading * np.sin(angle), one.level], one.values - shown)[1]
 

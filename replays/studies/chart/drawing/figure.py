@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from replays.report.canvas import WIDTH, house_style, new_figure, save
-from replays.studies.chart.drawing.look import ALARM, INK, QUIET, Row, draw_legend, look
 from replays.studies.chart.drawing.panel import (
     draw_energy,
     draw_frames,
@@ -23,6 +22,7 @@ from replays.studies.chart.drawing.panel import (
     window,
 )
 from replays.studies.chart.drawing.scene_panel import draw_markers, draw_scenes
+from replays.studies.chart.drawing.style import ALARM, INK, QUIET, Row, draw_legend, point_style
 from replays.studies.chart.methods import ADDED_FAMILY, RIG_FAMILY
 from replays.studies.chart.phases import MEMORY_CASES, PHASES, RUB, SCENE_TARGETS, SMOOTHING
 from replays.studies.chart.profile import TARGET
@@ -44,8 +44,8 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
     """
     makers: dict[str, tuple[str, Callable[[Any, list[Row]], str]]] = {
         "chart": ("exact", _hero),
-        "chart-exact": ("exact", _exact),
-        "chart-smoothed": ("smoothed", _smoothed),
+        "chart-exact": ("exact", _draw_exact),
+        "chart-smoothed": ("smoothed", _draw_smoothed),
         "chart-memory": ("memory", _memory),
         "chart-rub": (RUB, _rub),
         "chart-profile": ("profile", _profile_figure),
@@ -58,19 +58,19 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
         if panel not in panels or not any(row["family"] != "reference" for row in points):
             continue
         figure = new_figure(layout=None)
-        said = make(figure, rows)
-        _caption(figure, rows, said, command, note)
+        caption = make(figure, rows)
+        _caption(figure, rows, caption, command, note)
         source = ", ".join(sorted({f"code {row.get('code')}" for row in points}))
         files += save(figure, folder / f"{stem}.png", folder / f"{stem}.svg", source=source)
     return files
 
 
-def _caption(figure: Any, rows: list[Row], said: str, command: str, note: str) -> None:
+def _caption(figure: Any, rows: list[Row], caption: str, command: str, note: str) -> None:
     last = rows[-1]
     machine = " ".join(last["machine"].split())
     unbroken = command.replace(" ", "\N{NO-BREAK SPACE}")  # a command stays on one line
     text = (
-        f"{said} Made by `{unbroken}` ({last['mode']}): one thread on {machine}; {last['versions']}; "
+        f"{caption} Made by `{unbroken}` ({last['mode']}): one thread on {machine}; {last['versions']}; "
         f"commit {last['commit'] or 'unknown'}, {last['date']}."
     )
     text = f"{text} {note[:1].upper()}{note[1:]}." if note else text
@@ -138,11 +138,11 @@ def _hero(figure: Any, rows: list[Row]) -> str:
     return _NOTE + _timing(rows, "exact")
 
 
-def _exact(figure: Any, rows: list[Row]) -> str:
+def _draw_exact(figure: Any, rows: list[Row]) -> str:
     return _windows(figure, rows, "exact", "Exact Coulomb friction, phase by phase: total error", smoothed=True)
 
 
-def _smoothed(figure: Any, rows: list[Row]) -> str:
+def _draw_smoothed(figure: Any, rows: list[Row]) -> str:
     title = f"The smoothed law alone, vₛ = {SMOOTHING * 1e3:g} mm/s"
     return _windows(figure, rows, "smoothed", title) + (
         " All against the smoothed reference. What smoothing itself costs is on the exact charts."
@@ -248,7 +248,7 @@ def _rub(figure: Any, rows: list[Row]) -> str:
         if tight is not None:
             axes.axvspan(tight[f"{name}_low"] * scale, tight[f"{name}_high"] * scale, color="#e4ebf2", lw=0, zorder=0)
         for place, row in zip(y, points, strict=True):
-            style = look(row, rows)
+            style = point_style(row, rows)
             if row[name] is None:
                 axes.text(0.5, place, f"failed: {row['failure']}", transform=axes.get_yaxis_transform(), ha="center",
                           va="center", color=ALARM, fontsize=9)  # fmt: skip
@@ -261,11 +261,11 @@ def _rub(figure: Any, rows: list[Row]) -> str:
         axes.margins(x=0.15)
     axes = figure.add_subplot(grid[0, 3])
     for place, row in zip(y, points, strict=True):
-        axes.barh(place, row["speed"] or 0.0, color=look(row, rows)["color"], height=0.55, zorder=2)
+        axes.barh(place, row["speed"] or 0.0, color=point_style(row, rows)["color"], height=0.55, zorder=2)
         bound = own_speed(row) or 0.0
-        axes.barh(place, bound, color="none", edgecolor=look(row, rows)["color"], height=0.55, lw=0.8, ls=":")
-        said = f"{row['speed'] or 0.0:.3g}" + (f", bound {bound:.3g}" if bound else "")
-        axes.text(max(row["speed"] or 0.0, bound) * 1.08, place, said, va="center", fontsize=9, color=INK)
+        axes.barh(place, bound, color="none", edgecolor=point_style(row, rows)["color"], height=0.55, lw=0.8, ls=":")
+        caption = f"{row['speed'] or 0.0:.3g}" + (f", bound {bound:.3g}" if bound else "")
+        axes.text(max(row["speed"] or 0.0, bound) * 1.08, place, caption, va="center", fontsize=9, color=INK)
     axes.set(xscale="log", xlabel="times real time\n[s/s]", ylim=(-0.7, n - 0.3), yticks=y)
     axes.set_yticklabels([])
     axes.minorticks_off()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.chart.drawing.look import ALARM, FAILURES, Row, look, look_of_bound
+from replays.studies.chart.drawing.style import ALARM, FAILURES, Row, bound_style, point_style
 from replays.studies.chart.methods import ADDED_FAMILY, RIG_FAMILY
 from replays.studies.chart.profile import TARGET, profile_curves
 
@@ -18,13 +18,13 @@ _MIN_DRAWN_ERROR = 1e-9
 _ERROR_LABEL, _SPEED_LABEL = "scaled error against the reference [1]", "times real time [s/s]"
 
 
-def _inside(error: float) -> float:
+def _clip_error(error: float) -> float:
     return max(error, 1.2 * _MIN_DRAWN_ERROR)
 
 
-def _placed(row: Row) -> float:
+def _error_position(row: Row) -> float:
     """Return the position of a point on the error axis."""
-    return _inside(row["error"])
+    return _clip_error(row["error"])
 
 
 def own_speed(row: Row) -> float | None:
@@ -56,25 +56,25 @@ def window(axes: Any, rows: list[Row], all_rows: list[Row], *, title: str) -> No
     axes.set(xlim=(_MIN_DRAWN_ERROR, _STRIP_END), ylim=(low, high))
     axes.axvspan(_STRIP_BEGIN, _STRIP_END, color="#f4ecec", zorder=0, lw=0)
     for (method, case), line in lines.items():
-        style = look(line[0], all_rows)
+        style = point_style(line[0], all_rows)
         smoothed = case == "smoothed"
         if smoothed:
             style |= {"ls": (0, (1, 1.4)), "mfc": "white", "mec": style["color"], "lw": 1.6, "ms": 5.5}
         good = [row for row in line if row["error"] and row["failure"] in ("", "contacts")]
         good.sort(key=_fineness)
-        x = np.array([_placed(row) for row in good])
+        x = np.array([_error_position(row) for row in good])
         y = np.array([row["speed"] for row in good])
         spread = np.array([[row["speed"] - row["speed_min"], row["speed_max"] - row["speed"]] for row in good])
         axes.plot(x, y, gid=f"{method}{'-smoothed' if smoothed else ''}", **style)
         if len(good):
             axes.errorbar(x, y, yerr=spread.T.clip(0.0), fmt="none", ecolor=style["color"], elinewidth=1.0, zorder=3,
                           alpha=0.65)  # fmt: skip
-        bounds = [(_placed(row), speed) for row in good if (speed := own_speed(row)) is not None]
+        bounds = [(_error_position(row), speed) for row in good if (speed := own_speed(row)) is not None]
         if bounds:
-            axes.plot(*zip(*bounds, strict=True), gid=f"{method}-bound", **look_of_bound(line[0], all_rows))
+            axes.plot(*zip(*bounds, strict=True), gid=f"{method}-bound", **bound_style(line[0], all_rows))
         for row in good:
             if row["failure"] == "contacts":
-                axes.plot(_placed(row), row["speed"], "x", color=ALARM, ms=9, mew=1.6, zorder=9)
+                axes.plot(_error_position(row), row["speed"], "x", color=ALARM, ms=9, mew=1.6, zorder=9)
     _failures(axes, points, all_rows)
     _reference_bar(axes, rows)
     _limits(axes, rows)
@@ -92,7 +92,7 @@ def _failures(axes: Any, points: list[Row], all_rows: list[Row]) -> None:
     for row in points:
         if row["failure"] not in FAILURES:
             continue
-        color = look(row, all_rows)["color"]
+        color = point_style(row, all_rows)["color"]
         # Points without progress are drawn at the frame.
         bottom, top = axes.get_ylim()
         speed = min(max(row["speed"] or 0.0, 1.12 * bottom), top / (top / bottom) ** 0.05)
@@ -143,22 +143,22 @@ def label_lines(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
         line = [row for row in line if row["failure"] in ("", "contacts")]
         if line:
             end = min(line, key=lambda row: row["error"])
-            ends.append((end["error"], end["speed"], method, look(end, all_rows)["color"]))
-    taken: list[tuple[float, float]] = []
+            ends.append((end["error"], end["speed"], method, point_style(end, all_rows)["color"]))
+    occupied: list[tuple[float, float]] = []
     scale = axes.transData
     figure = axes.figure
     figure.canvas.draw()
     for error, speed, name, color in sorted(ends, key=lambda end: -end[1]):
-        x, y = scale.transform((_inside(error), speed))
+        x, y = scale.transform((_clip_error(error), speed))
         x -= 13
-        while any(abs(x - other_x) < 110 and abs(y - other_y) < 19 for other_x, other_y in taken):
+        while any(abs(x - other_x) < 110 and abs(y - other_y) < 19 for other_x, other_y in occupied):
             y -= 4
-        taken.append((x, y))
+        occupied.append((x, y))
         place = scale.inverted().transform((x, y))
         # At the frame there is room only above the line.
         outside = place[0] < 30 * _MIN_DRAWN_ERROR
         axes.text(
-            _inside(error) * (1.3 if outside else 1.0),
+            _clip_error(error) * (1.3 if outside else 1.0),
             place[1] * (1.1 if outside else 1.0),
             name if outside else f"{name}  ",
             color=color, fontsize=11, fontweight="bold", ha="left" if outside else "right",
@@ -183,7 +183,7 @@ def draw_energy(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
     for line in _lines(rows, "energy_residual", ours=True):
         x = [max(row["energy_residual"], 1e-15) for row in line]
         least = min(least, *x)
-        axes.plot(x, [row["speed"] for row in line], **look(line[0], all_rows))
+        axes.plot(x, [row["speed"] for row in line], **point_style(line[0], all_rows))
     axes.set_xlim(min(0.3 * least, 1e-4), 0.1)
     axes.axvline(1e-3, color=ALARM, lw=1.0, ls=(0, (4, 3)))
     axes.text(1e-3, 0.02, " alarm", transform=axes.get_xaxis_transform(), color=ALARM, fontsize=9, va="bottom")
@@ -198,7 +198,7 @@ def draw_frames(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
     axes.set(xscale="log", yscale="log")
     for line in _lines(rows, "worst_frame_ms", "error", ours=True):
         walls_us = [row["worst_frame_ms"] * 1e3 for row in line]
-        axes.plot([_placed(row) for row in line], walls_us, **look(line[0], all_rows))
+        axes.plot([_error_position(row) for row in line], walls_us, **point_style(line[0], all_rows))
     slowest = max((row["worst_frame_ms"] or 0.0 for row in rows), default=0.0) * 1e3
     axes.set(xlim=(_MIN_DRAWN_ERROR, _STRIP_BEGIN), ylim=(10.0, max(2.0 * slowest, 2e3)))
     axes.axhline(1e3, color=ALARM, lw=1.0, ls=(0, (4, 3)))
@@ -211,7 +211,7 @@ def draw_work(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
     axes.set(xscale="log", yscale="log", xlim=(_MIN_DRAWN_ERROR, _STRIP_BEGIN))
     for line in _lines(rows, "error", "evaluations", ours=False):
         evaluations = [row["evaluations"] / row["simulated_s"] for row in line]
-        axes.plot([_placed(row) for row in line], evaluations, **look(line[0], all_rows))
+        axes.plot([_error_position(row) for row in line], evaluations, **point_style(line[0], all_rows))
     axes.set(xlabel=_ERROR_LABEL, ylabel="evaluations a simulated second [1/s]")
     axes.set_title("Evaluations of the equations:\nlower left is better")
 
@@ -226,13 +226,13 @@ def draw_profile(axes: Any, rows: list[Row]) -> int:
     top = max((float(ratios[-1]) for ratios, _ in curves.values() if len(ratios)), default=10.0) * 1.6
     for method, (ratios, share) in curves.items():
         row = next(one for one in fair if one["method"] == method)
-        style = {key: value for key, value in look(row, rows).items() if key not in ("marker", "ms", "mec", "mew")}
+        style = {key: v for key, v in point_style(row, rows).items() if key not in ("marker", "ms", "mec", "mew")}
         x = np.concatenate([[1.0], ratios, [top]]) if len(ratios) else np.array([1.0, top])
         y = np.concatenate([[0.0], share, [share[-1]]]) if len(ratios) else np.zeros(2)
         axes.step(x, 100.0 * y, where="post", gid=f"profile-{method}", clip_on=False, **style)
     for method, (ratios, share) in (profile_curves(fair, column="own_cpu_s") if fair else {}).items():
         row = next(one for one in fair if one["method"] == method)
-        style = look_of_bound(row, rows)
+        style = bound_style(row, rows)
         # A bound below the best cost is drawn at that cost.
         x = np.concatenate([[1.0], ratios.clip(1.0), [top]])
         y = np.concatenate([[0.0], share, [share[-1] if len(share) else 0.0]])

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.studies.chart.drawing.look import ALARM, INK, QUIET, Row, look
 from replays.studies.chart.drawing.panel import own_speed
+from replays.studies.chart.drawing.style import ALARM, INK, QUIET, Row, point_style
 from replays.studies.chart.methods import RIG_FAMILY
 from replays.studies.common.twelve_scenes import TWELVE_SCENES
 from replays.studies.peers import PEERS
@@ -61,7 +61,7 @@ def compare(rows: list[Row], case: str) -> dict[str, Ratio]:
 
 def _style(row: Row, rows: list[Row]) -> dict[str, Any]:
     """Return the unique marker of a method."""
-    style = {name: value for name, value in look(row, rows).items() if name in ("color", "marker", "zorder")}
+    style = {name: value for name, value in point_style(row, rows).items() if name in ("color", "marker", "zorder")}
     style["marker"] = _PEER_MARKERS.get(row["method"], style["marker"])
     main = row["method"] == _MAIN
     return style | {"ls": "none", "ms": 10.0 if main else 6.0, "mec": INK if main else style["color"], "mew": 1.3}

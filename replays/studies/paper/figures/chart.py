@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, house_style, legend_below, new_figure
+from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, add_legend, house_style, new_figure
 from replays.studies.paper.scans.condition import (
     Start,
     Threshold,
@@ -18,7 +18,7 @@ from replays.studies.paper.scans.condition import (
     oscillator,
     rolling_whirl,
 )
-from replays.studies.paper.scans.pulse import Outcome
+from replays.studies.paper.scans.pulse import PulseRun
 from replays.studies.paper.scans.spread import percentiles
 from replays.studies.stability.trials.boundary import NAMES, STYLES
 from rig.physics.kernels.constants import Constants
@@ -103,7 +103,7 @@ def draw_verdicts(lines: list[Line]) -> Figure:
         xlim=(-1.1 * _EDGE_DISTANCE, 1.0 + 1.1 * _EDGE_DISTANCE),
         xlabel="our 5 to 95 % between the paper's\nsmallest (0) and largest (1) value [1]",
     )
-    legend_below(figure, columns=5)
+    add_legend(figure, columns=5)
     return figure
 
 
@@ -114,7 +114,7 @@ def _label(line: Line) -> str:
 
 
 @house_style()
-def draw_law(sweep: dict[float, Outcome]) -> Figure:
+def draw_law(sweep: dict[float, PulseRun]) -> Figure:
     """Draw the whirl frequency over spin, simulated and by closed form, and its error."""
     figure = new_figure(5.0, "Whirl frequency over spin")
     whirl, error = figure.subplots(1, 2)

@@ -15,9 +15,9 @@ from replays.report.canvas import (
     PINK,
     RED,
     SKY,
+    add_legend,
     draw_signals,
     house_style,
-    legend_below,
     new_figure,
 )
 from replays.studies.paper.reproduction import FIG_7_M, PULSE_S, SPEEDS_HZ, Reproduction, fine_spectrum, spectra
@@ -39,7 +39,7 @@ def _axis_lines(axes: Any, *levels: float, text: str = "the paper's labels", mea
     axes.plot([], [], label=text, **look)
 
 
-def _since_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
+def _time_from_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Return the time from the first rise of a force through 0 [ms], as in the paper's figures."""
     rises = np.flatnonzero((force[:-1] < 0.0) & (force[1:] >= 0.0))
     return (times_s - times_s[int(rises[0]) if len(rises) else 0]) * 1e3
@@ -56,7 +56,7 @@ def _columns(
     return figure, list(zip(found.values(), panels.T, strict=True))
 
 
-def _name_first(columns: list[tuple[Reproduction, Any]], *labels: str) -> None:
+def _label_first(columns: list[tuple[Reproduction, Any]], *labels: str) -> None:
     """Label the vertical axes of the first column."""
     for axes, label in zip(columns[0][1], labels, strict=True):
         axes.set_ylabel(label)
@@ -132,10 +132,10 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         _axis_lines(house, -40.0, 40.0, text="the paper's labels, measured", measured=True)
         for axes in (force, house):
             axes.set(xlabel="time, first impacts [ms]", xlim=first_impacts(run["penetration"], t))
-    _name_first(
+    _label_first(
         columns, "y in the ring [mm]", "y [mm]", "SOUTH reaction [N]", "acceleration of the\ninner housing [m/s²]"
     )
-    legend_below(figure, columns=5)
+    add_legend(figure, columns=5)
     return figure
 
 
@@ -171,8 +171,8 @@ def draw_hammer(found: dict[str, Reproduction]) -> Figure:
             _axis_lines(axes, -2.0, 2.0)
         for axes in (spin, across, up):
             axes.set(xlabel="time [s]")
-    _name_first(columns, "y in the ring [mm]", "spin [Hz]", "x at the probes [mm]", "y at the probes [mm]")
-    legend_below(figure, columns=5)
+    _label_first(columns, "y in the ring [mm]", "spin [Hz]", "x at the probes [mm]", "y at the probes [mm]")
+    add_legend(figure, columns=5)
     return figure
 
 
@@ -194,9 +194,9 @@ def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
             lines.plot(*fine_spectrum(run), color=colour, lw=1.6, label=label)
         lines.axvline(-83.7, color=RED, lw=1.4, ls=(0, (4, 3)), label="the paper, 83.7 Hz")
         lines.set(xlim=(-88.0, -78.0), xlabel="frequency [Hz]")
-    _name_first(columns, "frequency [Hz]\n← backward      forward →", "amplitude [mm]")
+    _label_first(columns, "frequency [Hz]\n← backward      forward →", "amplitude [mm]")
     figure.colorbar(mesh, ax=[column[0] for _, column in columns], label="amplitude [dB re 1 mm]", pad=0.02)
-    legend_below(figure)
+    add_legend(figure)
     return figure
 
 
@@ -219,8 +219,8 @@ def draw_reactions(found: dict[str, Reproduction]) -> Figure:
             settled.plot(t[last], sensed[last], color=RED, lw=0.9, label="transducers")
             _axis_lines(settled, -500.0, 500.0, text="the paper's labels: simulated above, measured below")
             settled.set(xlabel="time, settled whirl [s]")
-    _name_first(columns, "E − W [N]", "N − S [N]", "E − W [N]", "N − S [N]")
-    legend_below(figure)
+    _label_first(columns, "E − W [N]", "N − S [N]", "E − W [N]", "N − S [N]")
+    add_legend(figure)
     return figure
 
 
@@ -232,7 +232,7 @@ def draw_east(found: dict[str, Reproduction]) -> Figure:
         run = one.whirl
         last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.030)
         pair = (run["P_E"] - run["P_W"])[last]
-        t = _since_rise_ms(run.times_s[last], pair)
+        t = _time_from_rise_ms(run.times_s[last], pair)
         preload = run.simulation.model.constants.house.preload
         axes.plot(t, pair, color=BLUE, lw=2.0, label="E − W, truth")
         axes.plot(t, (run.samples["P_E"] - run.samples["P_W"])[last], color=RED, lw=0.9, label="E − W, transducers")
@@ -241,8 +241,8 @@ def draw_east(found: dict[str, Reproduction]) -> Figure:
         _axis_lines(axes, 0.0, 900.0, text="the paper's labels, simulated and measured")
         axes.axhline(500.0, color=PINK, lw=1.4, ls=(0, (1, 2)), zorder=1, label="Fig. 15's last label, measured")
         axes.set(xlabel="time [ms]", xlim=(0, 12))
-    _name_first(columns, "force [N]")
-    legend_below(figure, columns=3)
+    _label_first(columns, "force [N]")
+    add_legend(figure, columns=3)
     return figure
 
 
@@ -255,9 +255,9 @@ def draw_speeds(found: dict[str, Reproduction]) -> Figure:
             run = one.speeds[speed]
             pair = run["P_E"] - run["P_W"]
             last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.08)
-            t = _since_rise_ms(run.times_s[last], pair[last])
+            t = _time_from_rise_ms(run.times_s[last], pair[last])
             axes.plot(t, pair[last], color=colour, lw=1.8, label=f"{speed:g} Hz")
         axes.set(xlabel="time [ms]", xlim=(0, 24))
-    _name_first(columns, "E − W [N]")
-    legend_below(figure)
+    _label_first(columns, "E − W [N]")
+    add_legend(figure)
     return figure

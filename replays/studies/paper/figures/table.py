@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from replays.report import Row
 from replays.studies.common.closed_forms import impact
-from replays.studies.paper.claim import Bar, bars, toward_measured
+from replays.studies.paper.claim import Bar, bars, select_lower_ends
 from replays.studies.paper.findings import LENGTHS_MS, MARKS, Findings, Line
 from replays.studies.paper.scans.pulse import MEASURED_N
 from replays.studies.paper.scans.spread import column
@@ -32,7 +32,7 @@ def summary(lines: list[Line]) -> Content:
     return Content(headings, [line.row() for line in lines])
 
 
-def _printed(findings: Findings) -> Content:
+def _printed_values(findings: Findings) -> Content:
     sets = {name: load_parameters(name) for name in SETS}
     rows = []
     for printed in printed_values():
@@ -50,7 +50,7 @@ def _printed(findings: Findings) -> Content:
     return Content(("symbol", "where", "unit", "printed", *SETS, "why it differs", "corrected set"), rows)
 
 
-def _worked_out(findings: Findings) -> Content:
+def _derived_numbers(findings: Findings) -> Content:
     """Return the numbers that the text derives from its own."""
     p = load_parameters("corrected")
     printed_outer = next(entry.value for entry in printed_values() if entry.key == "house.outer_mass")
@@ -62,7 +62,7 @@ def _worked_out(findings: Findings) -> Content:
     # A free decay depends on the mass at the magnets, not on M.
     modal = p["shaft.transverse_inertia"] / p["shaft.arm_magnet"] ** 2
     zetas = {axis: p[f"shaft.damping_ratio_{axis}"] for axis in "xy"}
-    worked: list[tuple[str, float | None, float]] = [
+    derived: list[tuple[str, float | None, float]] = [
         ("D_bv = 2 ζ_x √(K_bv M_ih), ζ_x = 0.026 [N s/m]", 238.0,
          damping(0.026, "house.inner_beam_stiffness", inner)),
         ("D_bh = 2 ζ_y √(K_bh M_oh), ζ_y = 0.054, M_oh as printed [N s/m]", 1576.0,
@@ -72,14 +72,14 @@ def _worked_out(findings: Findings) -> Content:
     ]  # fmt: skip
     given = 0.90
     eq_44 = impact(mass=1.0, speed=0.1, stiffness=1e10, exponent=1.5, factor=0.75 * (1.0 - given**2), speed_floor=1e-3)
-    worked.append(("e that eq. 44 returns for a specified 0.90 [1]", given, eq_44.restitution))
+    derived.append(("e that eq. 44 returns for a specified 0.90 [1]", given, eq_44.restitution))
     for axis, zeta in zetas.items():
         of_mass = damping(zeta, "magnet.stiffness", p["shaft.mass"])
         decays = of_mass / damping(1.0, "magnet.stiffness", modal)
-        worked.append((f"D_{axis} = 2 ζ_{axis} √(K_mag M), eq. 10, K_mag assumed [N s/m]", None, of_mass))
-        worked.append((f"ζ_{axis} of that free decay, D_{axis}/(2 √(K_mag I_xx/l_0B²)), any K_mag", zeta, decays))
+        derived.append((f"D_{axis} = 2 ζ_{axis} √(K_mag M), eq. 10, K_mag assumed [N s/m]", None, of_mass))
+        derived.append((f"ζ_{axis} of that free decay, D_{axis}/(2 √(K_mag I_xx/l_0B²)), any K_mag", zeta, decays))
     rows = []
-    for name, printed, ours in worked:
+    for name, printed, ours in derived:
         if printed is None:
             rows.append(Row((name, "–", number(ours), "not printed")))
             continue
@@ -98,7 +98,7 @@ def idle_changes(findings: Findings) -> list[str]:
 def _tornado(findings: Findings) -> Content:
     found = bars(findings.results, "reaction_x_n")
     peaks = {bar.name: bar for bar in bars(findings.results, "peak_x_n")}
-    reached = {bar.name for bar in toward_measured(found)}
+    reached = {bar.name for bar in select_lower_ends(found)}
     idle = set(idle_changes(findings))
 
     def row(bar: Bar) -> Row:
@@ -133,8 +133,8 @@ def _lengths(findings: Findings) -> Content:
 
 
 TABLES: dict[str, Callable[[Findings], Content]] = {
-    "printed": _printed,
-    "worked-out": _worked_out,
+    "printed": _printed_values,
+    "worked-out": _derived_numbers,
     "lengths": _lengths,
     "tornado": _tornado,
 }

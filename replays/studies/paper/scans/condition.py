@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from replays.studies.ladder.quantity import find_rolling_start
-from replays.studies.paper.scans.pulse import Outcome, Pulse
+from replays.studies.paper.scans.pulse import Pulse, PulseRun
 from replays.studies.stability.trials.boundary import NAMES, ROLLING, whirl_class
 from replays.studies.stability.trials.motion import base_model, move, pivoted_mass, quiet_inputs, state
 from rig.channels.orbit import phase, whirl_frequency
@@ -256,7 +256,7 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ) -> list[Threshold
         closed = least_friction(oscillator(bare), -whirl)
         full = base_model(ModelLevels()).constants
         bare_mu, full_mu = (bisect(_make_test(each, spin), 0.3 * closed, 6.0 * closed) for each in (bare, full))
-        with_houses, used = friction_with_houses(full, spin), friction_used(full, spin)
+        with_houses, used = friction_with_houses(full, spin), friction_demand(full, spin)
         found.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
     return found
 
@@ -273,7 +273,7 @@ class Slip(NamedTuple):
     time_closed_s: float
 
 
-def spin_kept(constants: Constants) -> float:
+def remaining_spin(constants: Constants) -> float:
     """Return the part of its spin that a shaft keeps after slipping from rest on a rigid ring until it rolls [1].
 
     The friction impulse J gives m v = J along the ring and R_S J = I_zz (spin before - after); rolling means v = R_S
@@ -283,7 +283,7 @@ def spin_kept(constants: Constants) -> float:
     return shaft.polar_inertia / (shaft.polar_inertia + pivoted_mass(constants) * shaft.radius**2)
 
 
-def slips_to_rolling() -> list[Slip]:
+def find_slips() -> list[Slip]:
     """Return transitions from sliding whirl to rolling, simulated and by closed form.
 
     m r w' = mu N with N = m r (w^2 - w_n^2), so the time is the elementary integral of dw / (mu (w^2 - w_n^2)). The
@@ -292,7 +292,7 @@ def slips_to_rolling() -> list[Slip]:
     constants = bare_rig(0.25)
     constants = constants._replace(magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0), torque_gain=0.0)
     own, r0, radius = oscillator(constants), constants.contact.clearance, constants.shaft.radius
-    spin, kept, mu = 2.0 * math.pi * 6.2, spin_kept(constants), constants.contact.friction
+    spin, kept, mu = 2.0 * math.pi * 6.2, remaining_spin(constants), constants.contact.friction
     found = []
     for whirl_hz in (12.0, 20.0, 40.0):
         begin = 2.0 * math.pi * whirl_hz
@@ -309,7 +309,7 @@ def slips_to_rolling() -> list[Slip]:
     return found
 
 
-def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
+def friction_demand(constants: Constants, spin: float) -> tuple[float, float]:
     """Return mean and maximum of friction over normal force in a rolling whirl [1]."""
     inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
     motion = move(ENGINE, constants, inputs, settle_rolling(constants, spin), ticks=round(0.5 * _TICKS_S), every=100)
@@ -320,11 +320,11 @@ def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
 
 def _make_test(constants: Constants, spin: float) -> Callable[[float], bool]:
     """Return a test of whether a rolling whirl persists at a friction."""
-    begun = settle_rolling(constants, spin)
+    start = settle_rolling(constants, spin)
 
     def holds(mu: float) -> bool:
         changed = constants._replace(contact=constants.contact._replace(friction=mu))
-        return keeps_whirling(changed, begun, spin)
+        return keeps_whirling(changed, start, spin)
 
     return holds
 
@@ -398,6 +398,6 @@ def law_hz(speed_hz: float) -> tuple[float, float]:
     return whirl / (2.0 * math.pi), -speed_hz * constants.shaft.radius / constants.contact.clearance
 
 
-def law_error(result: Outcome, speed_hz: float) -> float:
+def law_error(result: PulseRun, speed_hz: float) -> float:
     """Return the relative deviation of the simulated whirl frequency from the closed form."""
     return result.whirl_hz / law_hz(speed_hz)[0] - 1.0

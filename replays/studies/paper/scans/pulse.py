@@ -57,7 +57,7 @@ class Pulse:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class PulseRun:
     """Results of a pulse; those of the whirl are NaN without whirl.
 
     Attributes:
@@ -144,17 +144,17 @@ def pulse_model(pulse: Pulse, changes: dict[str, Any]) -> Model:
     return build_model(own.override({key: v for key, v in changes.items() if key in own.entries}))
 
 
-def outcome(pulse: Pulse) -> Outcome:
+def outcome(pulse: Pulse) -> PulseRun:
     """Run a pulse and return its results; a rig that cannot be built is a result, too."""
     try:
         scene = pulse_scene(pulse)
         run = simulate(scene)
     except InputError:
-        return Outcome("cannot be built")
-    return read(run, at_s=scene.commands[0].at_s, bandwidth_hz=pulse.changes.get(BANDWIDTH))
+        return PulseRun("cannot be built")
+    return read_outcome(run, at_s=scene.commands[0].at_s, bandwidth_hz=pulse.changes.get(BANDWIDTH))
 
 
-def trace_of(run: Run) -> Trace:
+def make_trace(run: Run) -> Trace:
     """Return a run in the form used by the ladder's quantities."""
     contact, radius = run.simulation.model.constants.contact, run.simulation.model.constants.shaft.radius
     return Trace(
@@ -168,7 +168,7 @@ def trace_of(run: Run) -> Trace:
     )
 
 
-def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome:
+def read_outcome(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> PulseRun:
     """Return the results of a finished run.
 
     Args:
@@ -176,7 +176,7 @@ def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome
         at_s: Time of the pulse [s].
         bandwidth_hz: Corner of the low-pass on the reactions [Hz]; None: no low-pass.
     """
-    trace = trace_of(run)
+    trace = make_trace(run)
 
     def number(name: str) -> float:
         return float(QUANTITIES[name].read(trace))
@@ -194,9 +194,9 @@ def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome
         "contacts": int(run.simulation.health()["contacts"]),
     }
     if kind != "backward whirl":
-        return Outcome(kind, **whole)
+        return PulseRun(kind, **whole)
     settled = slice(-trace.settled_rows, None)
-    return Outcome(
+    return PulseRun(
         kind,
         whirl_hz=number("whirl_frequency"),
         spin_hz=number("spin"),
@@ -204,7 +204,7 @@ def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome
         ripple_n=number("force_ripple"),
         reaction_x_n=float(np.ptp(pair_x[settled]) / 2),
         reaction_y_n=float(np.ptp(pair_y[settled]) / 2),
-        depth_m=float(trace.settled("penetration").mean()),
+        depth_m=float(trace.settled_signal("penetration").mean()),
         ring_m=float(np.hypot(run["ring_x"], run["ring_y"])[settled].mean()),
         disk_m=float(np.abs(run["disk_x"][settled]).max()),
         roll_s=number("time_to_roll") - at_s,
@@ -253,7 +253,7 @@ def apply_low_pass(run: Run, signal: np.ndarray, bandwidth_hz: float) -> np.ndar
 
 def outcomes(
     pulses: Iterable[Pulse], *, processes: int, progress: Callable[[str], None] | None = None
-) -> Iterator[Outcome]:
+) -> Iterator[PulseRun]:
     """Run many pulses and yield their outcomes in order.
 
     Args:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from replays.studies.paper.scans.pulse import PULSE_AT, Outcome, Pulse
+from replays.studies.paper.scans.pulse import PULSE_AT, Pulse, PulseRun
 from rig.physics.parameters import DEFAULT_SET, load_parameters
 
 SEED = 2013
@@ -39,7 +39,7 @@ class Assumed(BaseModel, frozen=True, extra="forbid"):
     why: str
 
     @property
-    def taken_as(self) -> str:
+    def change_key(self) -> str:
         """Name in a pulse's changes."""
         return self.name or self.key
 
@@ -78,9 +78,9 @@ def changes(values: dict[str, float]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for entry in assumed_values():
         if entry.tied and entry.tied in values:
-            found[entry.taken_as] = values[entry.tied] / entry.ratio
+            found[entry.change_key] = values[entry.tied] / entry.ratio
         elif entry.key in values:
-            found[entry.taken_as] = values[entry.key]
+            found[entry.change_key] = values[entry.key]
     return found
 
 
@@ -119,7 +119,7 @@ def phases(pulse: Pulse, count: int) -> list[Pulse]:
     return [replace(pulse, changes={**pulse.changes, PULSE_AT: each}) for each in at_s]
 
 
-def column(results: list[Outcome], name: str) -> np.ndarray:
+def column(results: list[PulseRun], name: str) -> np.ndarray:
     """Return one number of many outcomes, NaN if missing, shape (n,)."""
     return np.array([float(getattr(result, name)) for result in results])
 

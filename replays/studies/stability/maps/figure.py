@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from replays.report.canvas import BLACK, RED, house_style, legend_below, new_figure, save
-from replays.studies.common.engines import friction_of, is_adaptive, traits
+from replays.report.canvas import BLACK, RED, add_legend, house_style, new_figure, save
+from replays.studies.common.engines import is_adaptive, supported_friction, traits
 from replays.studies.stability.maps import atlas
 from replays.studies.stability.trials import boundary
 from replays.studies.stability.trials.hammer import LEAST_SMOOTHING, least_smoothing_speed, smoothing_distance
-from replays.studies.stability.trials.impacts import first_impact, pushed
+from replays.studies.stability.trials.impacts import first_impact, push_error
 from rig.physics.engines import ENGINES
 
 _LEAST, _GROWS = 1e-14, 10.0
@@ -54,7 +54,7 @@ def draw_map(engines: list[str], *, quick: bool) -> Any:
     panels[0].set(ylabel="change of the energy, |E/E₀ − 1| [1]", ylim=(_LEAST, 8.0 * _GROWS))
     panels[0].plot([], [], color="0.4", ls=":", lw=1.5, label="limit by theory")
     panels[0].fill_between([], [], [], color="0.4", alpha=0.2, lw=0, label="5 to 95 % of all stiffnesses")
-    legend_below(figure, panels[0], columns=5)
+    add_legend(figure, panels[0], columns=5)
     return figure
 
 
@@ -96,7 +96,7 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
             smooth.loglog(reach, [smoothing_distance(engine, v) for v in reach], **style)
         places = np.geomspace(1e-5, 1.0, 11 if quick else 21)
         graze.loglog(places, [max(1e-12, first_impact(engine, float(v))["restitution"]) for v in places], **style)
-        stale.loglog(places, [max(1e-12, pushed(engine, speed_floor=float(v))) for v in places], **style)
+        stale.loglog(places, [max(1e-12, push_error(engine, speed_floor=float(v))) for v in places], **style)
     slope = smoothing_distance("tsit5", 1e-3) / 1e-3
     smooth.loglog(speeds, [slope * v for v in speeds], color="0.6", lw=5, alpha=0.5, zorder=0, label="linear in vₛ")
     lowest = 1e-5 if quick else 1e-6
@@ -123,7 +123,7 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
         title="Lasting contact, stale v₀:\npushed in with up to 1.6 kN",
         xlabel="v₀ held, its lower limit [m/s]", ylabel="error of the depth over the deepest [1]", ylim=(1e-12, 1e3),
     )  # fmt: skip
-    legend_below(figure, stale, smooth, columns=5)
+    add_legend(figure, stale, smooth, columns=5)
     return figure
 
 
@@ -132,7 +132,7 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
     """Draw the class of the run over friction and impulse, and the points at which an engine gives another class."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
-    able = [engine for engine in engines if friction_of(engine) == "exact"]
+    able = [engine for engine in engines if supported_friction(engine) == "exact"]
     points = 12 if quick else 28
     right = boundary.chart("taylor", points=points, tolerance=1e-12)
     figure = new_figure(5.2, "A pulse of 5 ms at 6.2 Hz: what has become of it after 0.6 s")
@@ -143,8 +143,8 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
                      shading="nearest", alpha=0.55, rasterized=True)  # fmt: skip
     for number in np.unique(right.classes):
         plane.plot([], [], "s", ms=9, color=colours(int(number)), alpha=0.55, mec="0.5", label=boundary.NAMES[number])
-    clear = boundary.clear_of_boundary(right.classes)
-    width, said = 0.38, []
+    clear = boundary.find_clear_points(right.classes)
+    width, bars = 0.38, []
     for row, engine in enumerate(able):
         wrong = boundary.chart(engine, points=points).classes != right.classes
         own, (rows, columns) = traits(engine), np.nonzero(wrong)
@@ -155,13 +155,13 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
         for offset, number, fill in ((-width / 2, found[0], own.colour), (width / 2, found[1], "white")):
             counts.barh(row + offset, number, height=width, color=fill, ec=own.colour, lw=1.2)
             counts.text(number, row + offset, f" {number}", va="center", fontsize=9.5)
-        said.append(found[0])
+        bars.append(found[0])
     plane.set(title=f"By taylor at a tolerance of 1e-12, {points} x {points} runs", xlabel="friction coefficient µ [1]",
               ylabel="impulse of the pulse [N s]")  # fmt: skip
     counts.set(title="Runs that end in another class", xlabel=f"runs of {right.classes.size} [1]",
-               xlim=(0, 1.15 * max([*said, 4])), ylim=(len(able) - 0.4, -0.6))  # fmt: skip
+               xlim=(0, 1.15 * max([*bars, 4])), ylim=(len(able) - 0.4, -0.6))  # fmt: skip
     counts.set_yticks(range(len(able)), able)
     counts.fill_between([], [], [], color="0.5", label="all of them")
     counts.fill_between([], [], [], fc="white", ec="0.5", label="of these off the boundary")
-    legend_below(figure, columns=6)
+    add_legend(figure, columns=6)
     return figure

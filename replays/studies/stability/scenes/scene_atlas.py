@@ -21,7 +21,7 @@ from replays.studies.chart.store import code_digest
 from replays.studies.common.twelve_scenes import TWELVE_SCENES
 from replays.studies.peers import Setting
 from replays.studies.peers.common.problem import scaled_error
-from replays.studies.stability.scenes.truth import AGREE_ERROR, WRONG_ERROR, doubted
+from replays.studies.stability.scenes.truth import AGREE_ERROR, WRONG_ERROR, is_doubted
 from replays.studies.stability.scenes.worker import Task, run_task
 from replays.studies.stability.table import choose_names
 from rig.base.errors import SimulationError
@@ -45,7 +45,7 @@ _GAINED = 0.01
 """Energy residual, relative to the dissipated energy, above which energy counts as gained."""
 
 
-class Outcome(NamedTuple):
+class SceneOutcome(NamedTuple):
     """Outcome of one run."""
 
     scene: str
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
         return self._asdict()
 
 
-def chosen_scenes(only: str | None) -> list[str]:
+def select_scenes(only: str | None) -> list[str]:
     """Return the scenes of a comma-separated list, in the order of the study; None selects all.
 
     Raises:
@@ -70,7 +70,7 @@ def chosen_scenes(only: str | None) -> list[str]:
     return choose_names("--only", only, list(TWELVE_SCENES))
 
 
-def is_silent(one: Outcome) -> bool:
+def is_silent(one: SceneOutcome) -> bool:
     """Return whether a run is wrong without a warning."""
     return one.kind in ("silent", "gained")
 
@@ -88,7 +88,7 @@ def exact_states(scene: Scene) -> np.ndarray:
     return first.states
 
 
-def outcomes(scenes: list[str], methods: list[str] | None = None, *, peers: bool = True) -> Iterator[Outcome]:
+def outcomes(scenes: list[str], methods: list[str] | None = None, *, peers: bool = True) -> Iterator[SceneOutcome]:
     """Run every method at each of its settings in each scene.
 
     Args:
@@ -113,7 +113,7 @@ def outcomes(scenes: list[str], methods: list[str] | None = None, *, peers: bool
                 if one.takes(scene.model.friction):
                     ran = _ours(one, setting, scene, exact) if one.ours else _peer(one, setting, name, exact)
                     kind, error = ran
-                yield Outcome(name, one.name, setting.label, kind, error)
+                yield SceneOutcome(name, one.name, setting.label, kind, error)
 
 
 def _ours(one: Competitor, setting: Setting, scene: Scene, exact: np.ndarray) -> tuple[str, float | None]:
@@ -122,7 +122,7 @@ def _ours(one: Competitor, setting: Setting, scene: Scene, exact: np.ndarray) ->
         return "refused" if done.failure == "refused" else "ended", None
     error = scaled_error(done.states, exact)
     gained = float(done.health["energy"]["residual_share"])
-    return _kind(error, warns=doubted(done.health), gained=gained), error
+    return _kind(error, warns=is_doubted(done.health), gained=gained), error
 
 
 def _peer(one: Competitor, setting: Setting, name: str, exact: np.ndarray) -> tuple[str, float | None]:
@@ -141,7 +141,7 @@ def _kind(error: float, *, warns: bool, gained: float) -> str:
 
 
 @house_style()
-def draw_scene_atlas(folder: Path, found: list[Outcome]) -> list[Path]:
+def draw_scene_atlas(folder: Path, found: list[SceneOutcome]) -> list[Path]:
     """Draw a row per method and a column per scene: outcomes of its settings, coarsest first.
 
     Returns:

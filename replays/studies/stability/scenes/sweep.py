@@ -12,7 +12,7 @@ from replays.studies.common.journal import Journal
 from replays.studies.common.provenance import commit, machine
 from replays.studies.common.random_scene import draw_scene
 from replays.studies.stability.scenes.truth import CHAOS_GROWTH, WRONG_ERROR, measure
-from replays.studies.stability.scenes.worker import Run, Task, Worker
+from replays.studies.stability.scenes.worker import SceneRun, Task, Worker
 from rig.base.errors import InputError
 from rig.physics.kernels import source_digest
 
@@ -25,7 +25,7 @@ _LIMIT_S = 20.0
 """Processor time per run [s]."""
 
 
-def chosen_numbers(only: str | None, count: int) -> list[int]:
+def select_numbers(only: str | None, count: int) -> list[int]:
     """Return the numbers of a comma-separated list; None selects all from 0.
 
     Raises:
@@ -45,7 +45,7 @@ def sweep(
     seed: int,
     engines: list[str],
     folder: Path | None = None,
-    run: Callable[[Task], Run] | None = None,
+    run: Callable[[Task], SceneRun] | None = None,
 ) -> Iterator[Row]:
     """Yield the measured scenes, those in the folder's journal first.
 
@@ -104,7 +104,7 @@ def summary(rows: list[Row], engines: list[str]) -> Row:
     }
 
 
-def silent(one: Row) -> bool:
+def is_silent(one: Row) -> bool:
     """Return whether a run is wrong without a warning."""
     return one["error"] is not None and one["error"] > WRONG_ERROR and not one["doubted"]
 
@@ -121,8 +121,8 @@ def _engine(runs: list[tuple[Row, Row]]) -> Row:
         return [row["number"] for row, one in runs if kind(one) and row["status"] != "unbounded"]
 
     ran = [(row, one) for row, one in runs if one["failure"] != "refused"]
-    told = [(row, one) for row, one in ran if one["error"] is not None]
-    calm = [one for row, one in told if not (row["growth"] and row["growth"] >= CHAOS_GROWTH)]
+    compared = [(row, one) for row, one in ran if one["error"] is not None]
+    calm = [one for row, one in compared if not (row["growth"] and row["growth"] >= CHAOS_GROWTH)]
     speeds = [one["speed"] for _, one in ran if one["speed"]]
     refused: dict[str, int] = {}
     for _, one in runs:
@@ -130,13 +130,13 @@ def _engine(runs: list[tuple[Row, Row]]) -> Row:
             refused[one["message"]] = refused.get(one["message"], 0) + 1
     return {
         "runs": len(ran),
-        "told": len(told),
+        "told": len(compared),
         "asked": max((one["asked"] for _, one in runs), default=None),
-        "error": _quantiles([one["error"] for _, one in told]),
+        "error": _quantiles([one["error"] for _, one in compared]),
         "calm": len(calm),
         "within": sum(one["error"] <= _TOLERANCE_MARGIN * one["asked"] for one in calm) / len(calm) if calm else None,
         "wrong": scenes(lambda one: one["error"] is not None and one["error"] > WRONG_ERROR),
-        "silent": scenes(silent),
+        "silent": scenes(is_silent),
         "false_alarms": scenes(false_alarm),
         "crashes": scenes(lambda one: one["failure"] == "crash"),
         "hangs": scenes(lambda one: one["failure"] == "hang"),

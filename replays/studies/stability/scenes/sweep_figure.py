@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.report.canvas import RED, house_style, legend_below, new_figure, save
+from replays.report.canvas import RED, add_legend, house_style, new_figure, save
 from replays.studies.common.engines import traits
 from replays.studies.stability.scenes.sweep import summary
 from replays.studies.stability.scenes.truth import WRONG_ERROR
@@ -66,7 +66,7 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
     )  # fmt: skip
     speeds.tick_params(labelleft=True)
     speeds.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    legend_below(figure, errors, columns=4)
+    add_legend(figure, errors, columns=4)
     return save(figure, *(folder / f"stability-sweep{suffix}" for suffix in (".png", ".svg")))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from replays.studies.peers.common.problem import scaled_error
-from replays.studies.stability.scenes.worker import Run, Task
+from replays.studies.stability.scenes.worker import SceneRun, Task
 from rig.base.text import replace_nonfinite
 from rig.physics.engines import ENGINES
 from rig.run.scenes import Scene, scene_document
@@ -36,17 +36,17 @@ _NO_DOUBT = ("would have pulled", "lie after its end", "contacts began slower")
 Row = dict[str, Any]
 
 
-def doubted(health: Row) -> bool:
+def is_doubted(health: Row) -> bool:
     """Return whether a run warns that it may be wrong."""
     return any(not any(words in warning for words in _NO_DOUBT) for warning in health["warnings"])
 
 
-def asked(engine: str, tolerance: float = 0.0) -> float:
+def requested_error(engine: str, tolerance: float = 0.0) -> float:
     """Return the scaled error that an engine is requested to keep."""
     return tolerance or ENGINES[engine].tolerance or FIXED_STEP_ERROR
 
 
-def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, limit_s: float = 20.0) -> Row:
+def measure(scene: Scene, engines: list[str], run: Callable[[Task], SceneRun], *, limit_s: float = 20.0) -> Row:
     """Run a scene with the accurate engines and with those under test.
 
     Args:
@@ -60,15 +60,15 @@ def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, lim
         `status`: decided, chaotic (they differ as after a shift), undecided (they differ otherwise), untold (no two
         runs are complete) or unbounded; `accurate` and `tested`, a row per run.
     """
-    accurate: list[tuple[Task, Run]] = []
+    accurate: list[tuple[Task, SceneRun]] = []
     for engine, tolerance in ACCURATE:
-        sure = [done for _, done in accurate if not done.failure and not doubted(done.health)]
-        if len(sure) >= 2 and _distance(*sure[:2]) <= AGREE_ERROR:
+        reliable = [done for _, done in accurate if not done.failure and not is_doubted(done.health)]
+        if len(reliable) >= 2 and _distance(*reliable[:2]) <= AGREE_ERROR:
             break
         task = Task(scene, engine, tolerance, limit_s=limit_s)
         accurate.append((task, run(task)))
     good = [(task, done) for task, done in accurate if not done.failure]
-    good.sort(key=lambda pair: doubted(pair[1].health))  # runs with a warning come last
+    good.sort(key=lambda pair: is_doubted(pair[1].health))  # runs with a warning come last
     distance = _distance(good[0][1], good[1][1]) if len(good) > 1 else None
     growth = _growth(*good[0], run) if good else None
     status = "untold"
@@ -96,11 +96,11 @@ def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, lim
     return replace_nonfinite(document)
 
 
-def _row(task: Task, done: Run, truths: list[tuple[Task, Run]], peak: float | None) -> Row:
+def _row(task: Task, done: SceneRun, truths: list[tuple[Task, SceneRun]], peak: float | None) -> Row:
     """Return the row of a run, compared with the first accurate run of another engine."""
     row: Row = {
         "engine": task.engine,
-        "asked": asked(task.engine, task.tolerance),
+        "asked": requested_error(task.engine, task.tolerance),
         "failure": done.failure,
         "message": done.message,
         "cpu_s": done.cpu_s,
@@ -112,7 +112,7 @@ def _row(task: Task, done: Run, truths: list[tuple[Task, Run]], peak: float | No
     if not done.health:
         return row
     force = done.health["peak_normal_force_n"]
-    row |= {"doubted": doubted(done.health), "contacts": done.health["contacts"], "peak_n": force}
+    row |= {"doubted": is_doubted(done.health), "contacts": done.health["contacts"], "peak_n": force}
     row |= {"residual_share": done.health["energy"]["residual_share"], "warnings": done.health["warnings"]}
     if peak is not None:
         row["absurd"] = not force <= _MAX_PEAK_RATIO * max(peak, _MIN_PEAK_N)
@@ -121,11 +121,11 @@ def _row(task: Task, done: Run, truths: list[tuple[Task, Run]], peak: float | No
     return row
 
 
-def _distance(a: Run, b: Run) -> float:
+def _distance(a: SceneRun, b: SceneRun) -> float:
     return scaled_error(a.states, b.states)
 
 
-def _growth(task: Task, done: Run, run: Callable[[Task], Run]) -> float | None:
+def _growth(task: Task, done: SceneRun, run: Callable[[Task], SceneRun]) -> float | None:
     """Return the largest distance between a run and a shifted one, relative to the initial distance."""
     other = run(task._replace(nudge=INITIAL_SHIFT))
     if other.failure:
@@ -134,7 +134,7 @@ def _growth(task: Task, done: Run, run: Callable[[Task], Run]) -> float | None:
     return float(np.max(apart)) / apart[0]
 
 
-def _find_deviating_engine(runs: list[tuple[Task, Run]]) -> str | None:
+def _find_deviating_engine(runs: list[tuple[Task, SceneRun]]) -> str | None:
     """Return the engine whose run differs from two that agree, among three accurate runs."""
     if len(runs) < 3:
         return None

@@ -47,7 +47,7 @@ class Task(NamedTuple):
 
 
 @dataclass
-class Run:
+class SceneRun:
     """Result of a run."""
 
     failure: str = ""
@@ -63,24 +63,24 @@ class Run:
     """`Simulation.health` at the end."""
 
 
-def run_task(task: Task, begun: Callable[[], None] = lambda: None) -> Run:
+def run_task(task: Task, on_begin: Callable[[], None] = lambda: None) -> SceneRun:
     """Execute a run in this process.
 
     Args:
         task: The run.
-        begun: Function called after compilation, before the first step.
+        on_begin: Function called after compilation, before the first step.
     """
-    done, kept = Run(), []
-    asked = {"name": task.engine, "tolerance": task.tolerance, "step_us": task.step_us}
+    done, kept = SceneRun(), []
+    settings = {"name": task.engine, "tolerance": task.tolerance, "step_us": task.step_us}
     try:
         changes: dict[str, Any] = {f"sensors.{key}": value for key, value in bare_sensors(RATE_HZ).items()}
-        changes |= {f"engine.{key}": value for key, value in asked.items() if value}
+        changes |= {f"engine.{key}": value for key, value in settings.items() if value}
         scene = change_scene(task.scene, changes)
         simulation = Simulation(shift_start(scene, task.nudge) if task.nudge else scene)
         _ = simulation.first_row  # compiles
-        begun()
+        on_begin()
     except InputError as error:
-        return Run("refused", str(error))
+        return SceneRun("refused", str(error))
     try:
         while simulation.tick < simulation.end_tick:
             begin = time.thread_time()
@@ -122,7 +122,7 @@ class Worker:
     def __exit__(self, *_: object) -> None:
         self._end()
 
-    def run(self, task: Task) -> Run:
+    def run(self, task: Task) -> SceneRun:
         """Execute a run in the process."""
         try:
             self._pipe.send(task)
@@ -133,8 +133,8 @@ class Worker:
         self._end()
         self._start()
         if status == -signal.SIGXCPU:
-            return Run("hang", f"does not return in {task.limit_s:g} s of processor time")
-        return Run("crash", f"its process died (exit status {status})")
+            return SceneRun("hang", f"does not return in {task.limit_s:g} s of processor time")
+        return SceneRun("crash", f"its process died (exit status {status})")
 
     def _start(self) -> None:
         context = get_context("spawn")
@@ -154,11 +154,11 @@ def _serve(pipe: Connection) -> None:
     end_with_parent()
     while True:
         task = pipe.recv()
-        end_after(_COMPILING_S)
-        pipe.send(run_task(task, partial(end_after, task.limit_s + _GRACE_S)))
+        limit_processor_time(_COMPILING_S)
+        pipe.send(run_task(task, partial(limit_processor_time, task.limit_s + _GRACE_S)))
 
 
-def end_after(limit_s: float) -> None:
+def limit_processor_time(limit_s: float) -> None:
     """Limit the further processor time of this process [s], unaffected by other load."""
     most = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(time.process_time() + limit_s), most))

@@ -57,7 +57,7 @@ def chart(engine: str, *, points: int, tolerance: float = 0.0) -> Boundary:
     return Boundary(engine, frictions, forces, np.reshape(classes, (points, points)))
 
 
-def clear_of_boundary(reference: np.ndarray) -> np.ndarray:
+def find_clear_points(reference: np.ndarray) -> np.ndarray:
     """Return points whose four neighbours have the same class; the error of no method should change them."""
     padded = np.pad(reference, 1, mode="edge")
     same = np.ones(reference.shape, dtype=bool)

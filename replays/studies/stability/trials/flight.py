@@ -90,7 +90,7 @@ def pulse_cases(engine: str, quick: bool) -> Iterator[Cell]:
     for case, step in (("own step", 0), ("longest step a scene takes, 1 ms", 1000)):
         # Nothing else moves, so an adaptive engine reaches the pulse with its longest steps.
         motion = move(engine, constants, quiet_inputs(pulse=(force, start, end)), state(), ticks=200_000, step=step)
-        got = float(motion.end_of("beta_rate")) * constants.shaft.transverse_inertia
+        got = float(motion.final_value("beta_rate")) * constants.shaft.transverse_inertia
         allowance = traits(engine).allowance
         # A low-order engine resolves the pulse poorly: the trapezoidal rule with five steps.
         limit = 0.5 if step and allowance > 1.0 else 1e-3 * allowance

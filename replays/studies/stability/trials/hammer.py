@@ -10,11 +10,11 @@ from itertools import pairwise
 import numpy as np
 
 from replays.studies.common.closed_forms import RUNGE_KUTTA_4_REAL_LIMIT
-from replays.studies.common.engines import friction_of, is_adaptive, traits
+from replays.studies.common.engines import is_adaptive, supported_friction, traits
 from replays.studies.peers.common.problem import scaled_error
 from replays.studies.stability.trials.boundary import QUICK_POINTS, whirl_class
 from replays.studies.stability.trials.cell import Cell
-from replays.studies.stability.trials.motion import Motion, hammer_run, move
+from replays.studies.stability.trials.motion import MotionResult, hammer_run, move
 from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import COLUMN
 
@@ -25,12 +25,12 @@ LEAST_SMOOTHING = 0.9e-6
 
 
 @cache
-def _whirl(engine: str, friction: str) -> Motion:
+def _whirl(engine: str, friction: str) -> MotionResult:
     constants, inputs, y0 = hammer_run(friction)
     return move(engine, constants, inputs, y0, ticks=1_000_000, every=1000)
 
 
-def _slip(motion: Motion) -> float:
+def _slip(motion: MotionResult) -> float:
     """Return the RMS sliding speed in contact over the last 0.1 s [m/s]; NaN without contact."""
     part = motion.rows[motion.times > motion.times[-1] - 0.1]
     part = part[part[:, COLUMN["penetration"]] > 0.0]
@@ -39,7 +39,7 @@ def _slip(motion: Motion) -> float:
 
 def rolling_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """Yield T3: exact rolling has no slip; a smoothed law creeps."""
-    if friction_of(engine) == "exact":
+    if supported_friction(engine) == "exact":
         yield Cell("exact Coulomb", _slip(_whirl(engine, "exact")), 2e-5, "rolling is a constraint: no slip",
                    unit="m/s")  # fmt: skip
     if "smoothed" in ENGINES[engine].frictions:
@@ -55,7 +55,7 @@ def rolling_cases(engine: str, quick: bool) -> Iterator[Cell]:
                    f"v_s atanh(needed / mu) = {creep:.2e} m/s")  # fmt: skip
 
 
-def first_impacts(engine: str, law: str, *, step: int = 0, tolerance: float = 0.0, **contact: float) -> Motion:
+def first_impacts(engine: str, law: str, *, step: int = 0, tolerance: float = 0.0, **contact: float) -> MotionResult:
     """Return the first impacts of the full rig under a friction law; `contact` as in `hammer_run`."""
     constants, inputs, y0 = hammer_run(law, **contact)
     inputs = inputs._replace(hammer_start=0, hammer_end=5000)
@@ -63,7 +63,7 @@ def first_impacts(engine: str, law: str, *, step: int = 0, tolerance: float = 0.
 
 
 @cache
-def sharp_impacts(friction: str) -> Motion:
+def sharp_impacts(friction: str) -> MotionResult:
     """Return the first impacts at the highest accuracy; "exact" is Coulomb's set-valued law."""
     return first_impacts("rk8", friction, step=25, tolerance=1e-12)
 
@@ -86,7 +86,7 @@ def least_smoothing_speed(engine: str) -> float:
 def smoothing_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """Yield T7: the exact law, and smoothed ones that approach it."""
     allowance = traits(engine).allowance
-    if friction_of(engine) == "exact":
+    if supported_friction(engine) == "exact":
         distance = scaled_error(first_impacts(engine, "exact").states, sharp_impacts("exact").states)
         yield Cell("exact law", distance, 5e-4 * allowance, "the set-valued limit itself")
     if "smoothed" not in ENGINES[engine].frictions:
@@ -112,7 +112,7 @@ def smoothing_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 def boundary_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """Yield T9: points on both sides of the boundary of whirl."""
-    if friction_of(engine) != "exact":
+    if supported_friction(engine) != "exact":
         return
     wrong = sum(whirl_class(engine, mu, force) != right for mu, force, right in QUICK_POINTS)
     yield Cell(f"{len(QUICK_POINTS)} points beside the boundary", float(wrong), 0.0,
@@ -125,7 +125,7 @@ REFERENCE_ERROR = 1e-10
 
 def ladder(engine: str) -> list[float]:
     """Return the errors of the first impacts at increasingly fine steps or tolerances."""
-    friction = friction_of(engine)
+    friction = supported_friction(engine)
     if is_adaptive(engine):
         tolerances = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
         motions = [first_impacts(engine, friction, tolerance=tolerance) for tolerance in tolerances]

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from replays.studies.common.closed_forms import RUNGE_KUTTA_4_REAL_LIMIT, impact, pushed_contact
-from replays.studies.common.engines import friction_of, is_adaptive, traits
+from replays.studies.common.engines import is_adaptive, supported_friction, traits
 from replays.studies.stability.trials.cell import Cell
 from replays.studies.stability.trials.motion import (
-    Motion,
+    MotionResult,
     bare_shaft,
     base_model,
     move,
@@ -26,10 +26,10 @@ from rig.physics.levels import ModelLevels
 ONSET_SPEEDS = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
 """Approach speeds [m/s]."""
 PUSH_N = 1000.0
-"""Peak force at the disk in `pushed` [N]."""
+"""Peak force at the disk in `push_error` [N]."""
 
 
-def bounce(engine: str, step: int = 0) -> tuple[float, Motion]:
+def bounce(engine: str, step: int = 0) -> tuple[float, MotionResult]:
     """Return the largest energy drift in flight over 25 elastic, frictionless impacts, and the motion."""
     constants = bare_shaft(damping_factor=0.0)
     shaft, magnet = constants.shaft, constants.magnet
@@ -67,12 +67,12 @@ def first_impact(engine: str, speed: float, *, tolerance: float = 0.0) -> dict[s
     y0 = state(beta=(contact.clearance - speed * onset) / shaft.arm_ring, beta_rate=speed / shaft.arm_ring)
     ticks = 1000 * math.ceil(2.0 + 2e3 * right.duration)
     motion = move(engine, constants, quiet_inputs(), y0, ticks=ticks, tolerance=tolerance)
-    back = -motion.end_of("beta_rate") * shaft.arm_ring
-    place = motion.end_of("beta") * shaft.arm_ring
+    back = -motion.final_value("beta_rate") * shaft.arm_ring
+    place = motion.final_value("beta") * shaft.arm_ring
     lift_off = ticks * 1e-6 - (contact.clearance - place) / back
     return {
         "restitution": abs(back / speed / right.restitution - 1.0),
-        "impulse": abs(motion.end_of("contact_impulse") / right.impulse - 1.0),
+        "impulse": abs(motion.final_value("contact_impulse") / right.impulse - 1.0),
         "peak": abs(motion.peak_force / right.peak - 1.0),
         "duration": abs((lift_off - onset) / right.duration - 1.0),
         "floored": float(motion.memory[FLOORED]),
@@ -104,7 +104,7 @@ def grazing_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 def drop_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """Yield T10: a drop of the full rig from the top of the ring."""
-    model = base_model(ModelLevels.model_validate({"friction": friction_of(engine)}))
+    model = base_model(ModelLevels.model_validate({"friction": supported_friction(engine)}))
     constants = model.constants
     constants = constants._replace(contact=constants.contact._replace(damping_factor=1.4328))  # e = 0.5
     y0 = model.state(ring_x=0.0, ring_y=constants.contact.clearance * (1.0 - 1e-12))
@@ -117,7 +117,7 @@ def drop_cases(engine: str, quick: bool) -> Iterator[Cell]:
     yield Cell("steps given up", float(motion.memory[CEILING]), 0.0, "no stall")
 
 
-def pushed(engine: str, *, speed_floor: float) -> float:
+def push_error(engine: str, *, speed_floor: float) -> float:
     """Return the relative error of the depth of a shaft that is pushed from rest into the ring for 20 ms.
 
     v0 is latched at its lower limit, when nothing moves, and stays constant while the force grows to about 1.6 kN, so
@@ -144,7 +144,7 @@ def pushed(engine: str, *, speed_floor: float) -> float:
 
 
 def stale_stiffness(engine: str, speed_floor: float) -> float:
-    """Return h lambda of the damping with outdated v0 at an engine's own step: c F/(v0 m) h at the peak of `pushed`."""
+    """Return h lambda of the damping with outdated v0 at an engine's own step: c F/(v0 m) h at peak force."""
     constants = bare_shaft(speed_floor=speed_floor)
     load = PUSH_N * constants.shaft.arm_disk / constants.shaft.arm_ring
     rate = constants.contact.damping_factor * load / speed_floor / pivoted_mass(constants)
@@ -154,7 +154,7 @@ def stale_stiffness(engine: str, speed_floor: float) -> float:
 def stale_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """Yield T14: lasting contact with an outdated v0."""
     own = traits(engine)
-    yield Cell("v0 = 1e-2 m/s", pushed(engine, speed_floor=1e-2), 2e-2,
+    yield Cell("v0 = 1e-2 m/s", push_error(engine, speed_floor=1e-2), 2e-2,
                f"h lambda = {stale_stiffness(engine, 1e-2):.2g} and less: not stiff")  # fmt: skip
     for limit in (1e-3, 1e-4, 1e-5):
         z = stale_stiffness(engine, limit)
@@ -166,4 +166,4 @@ def stale_cases(engine: str, quick: bool) -> Iterator[Cell]:
             because = f"measured, h lambda = {z:.2g}: {own.damping_because}"
             if own.on_real_axis:
                 because = f"h lambda = {z:.2g} against {RUNGE_KUTTA_4_REAL_LIMIT:.4g}"
-        yield Cell(f"v0 = {limit:.0e} m/s", pushed(engine, speed_floor=limit), 2e-2, because, expected)
+        yield Cell(f"v0 = {limit:.0e} m/s", push_error(engine, speed_floor=limit), 2e-2, because, expected)

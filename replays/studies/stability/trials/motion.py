@@ -49,7 +49,7 @@ def quiet_inputs(
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionResult:
     """Motion of a system computed by an engine.
 
     Attributes:
@@ -73,7 +73,7 @@ class Motion:
         """Return one column of the rows, shape (n,)."""
         return self.rows[:, COLUMN[name]]
 
-    def end_of(self, name: str) -> float:
+    def final_value(self, name: str) -> float:
         """Return one state or integral at the end."""
         return float(self.end[COLUMN[name]])
 
@@ -98,7 +98,7 @@ def move(
     step: int = 0,
     every: int = 0,
     tolerance: float = 0.0,
-) -> Motion:
+) -> MotionResult:
     """Run an engine on a system.
 
     Args:
@@ -117,7 +117,7 @@ def move(
     rows = np.empty((steps // stride, N_ROW))
     course.advance(steps, stride, rows)
     times = np.arange(len(rows)) * stride * course.step * inputs.tick_s
-    return Motion(times=times, rows=rows, end=course.y, memory=course.memory)
+    return MotionResult(times=times, rows=rows, end=course.y, memory=course.memory)
 
 
 def state(**values: float) -> np.ndarray:

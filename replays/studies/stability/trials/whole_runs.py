@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from replays.studies.common.engines import friction_of, is_adaptive, traits
+from replays.studies.common.engines import is_adaptive, supported_friction, traits
 from replays.studies.common.run import bare_sensors
 from replays.studies.stability.trials.cell import Cell
 from rig.base.errors import SimulationError
@@ -24,7 +24,7 @@ def engine_scene(name: str, **choice: float) -> Scene:
     method = ENGINES[name]
     settings = {"name": name, "step_us": method.step_us, "tolerance": method.tolerance, **choice}
     engine = EngineChoice.model_validate(settings)
-    levels = scene.model.model_copy(update={"friction": friction_of(name)})
+    levels = scene.model.model_copy(update={"friction": supported_friction(name)})
     sensors = scene.sensors.model_copy(update={**bare_sensors(), "groups": ("hammer",)})
     return scene.model_copy(update={"engine": engine, "model": levels, "sensors": sensors})
 
@@ -62,7 +62,7 @@ def _is_poisoned(engine: str) -> bool:
     return False
 
 
-def warnings_of(scene: Scene, ticks: int) -> list[str]:
+def collect_warnings(scene: Scene, ticks: int) -> list[str]:
     """Return the warnings of a run at its end, or the error that ended it."""
     simulation = Simulation(scene)
     try:
@@ -75,7 +75,7 @@ def warnings_of(scene: Scene, ticks: int) -> list[str]:
     return simulation.health()["warnings"]
 
 
-def _silent(warnings: list[str], *words: str) -> float:
+def _is_silent(warnings: list[str], *words: str) -> float:
     """Return 0 if a warning contains one of the words, otherwise 1."""
     return float(not any(word in warning for warning in warnings for word in words))
 
@@ -85,16 +85,16 @@ def warning_cases(engine: str, quick: bool) -> Iterator[Cell]:
     yield Cell("nan", float(not _is_poisoned(engine)), 0.0, "the state is checked", unit="silent")
     # A step of 1 ms is much too long without error control; with it, use a tolerance that cannot be met.
     if is_adaptive(engine):
-        warnings = warnings_of(engine_scene(engine, step_us=500, tolerance=1e-30), 1000)
-        yield Cell("tolerance out of reach", _silent(warnings, "engine.tolerance"), 0.0,
+        warnings = collect_warnings(engine_scene(engine, step_us=500, tolerance=1e-30), 1000)
+        yield Cell("tolerance out of reach", _is_silent(warnings, "engine.tolerance"), 0.0,
                    "the step's ceiling is counted", unit="silent")  # fmt: skip
     else:
         for case, step in (("step of 100 us", 100), ("step of 1 ms", 1000)):
-            warnings = warnings_of(engine_scene(engine, step_us=step), traits(engine).warned_within_ticks)
-            silent, because = _silent(warnings, "energy residual ", "finite"), "the ledger sees it"
+            warnings = collect_warnings(engine_scene(engine, step_us=step), traits(engine).warned_within_ticks)
+            silent, because = _is_silent(warnings, "energy residual ", "finite"), "the ledger sees it"
             yield Cell(case, silent, 0.0, because, unit="silent")
     base = engine_scene(engine)
     for case, word, floor_mm_s in (("v0 at its floor", "speed_floor", 50.0), ("law that would pull", "pulled", 1.0)):
         drop = load_scene("drop", {"contact.damping_factor": 1.4328, "contact.speed_floor": floor_mm_s})
         drop = drop.model_copy(update={"engine": base.engine, "model": base.model, "sensors": base.sensors})
-        yield Cell(case, _silent(warnings_of(drop, 500_000), word), 0.0, "counted", unit="silent")
+        yield Cell(case, _is_silent(collect_warnings(drop, 500_000), word), 0.0, "counted", unit="silent")

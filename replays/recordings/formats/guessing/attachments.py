@@ -22,7 +22,7 @@ _EXCLUDED = {"duration_s", "fidelity", "pick", "set", "commands", "channels", "s
 """Fields that an import determines, or that are handled separately."""
 
 
-class Attached(NamedTuple):
+class Attachments(NamedTuple):
     """Content for a mapping from the rig's documents in a file.
 
     Attributes:
@@ -36,10 +36,10 @@ class Attached(NamedTuple):
     doubt: str = ""
 
 
-def attached(source: Source) -> Attached:
+def read_attachments(source: Source) -> Attachments:
     """Return the documents that `rig export` attached to a file."""
     if set(source.documents) != set(DOCUMENTS):
-        return Attached()
+        return Attachments()
     try:
         read = {
             kind: documents.read(model, source.documents[f"{kind}.json"].encode(), field=f"{kind}.json")
@@ -47,11 +47,11 @@ def attached(source: Source) -> Attached:
         }
         experiment = _experiment(read["scene"][0], read["parameters"][0], source)
     except (ValueError, TypeError) as error:  # including times of another type
-        return Attached(doubt=printable(str(error)))
+        return Attachments(doubt=printable(str(error)))
     catalogue = read["catalogue"][1]
     assert isinstance(catalogue, documents.Catalogue)
     # The filters of imported recordings were only assumed.
-    return Attached({} if "import" in read["scene"][0] else catalogue.table.channels, tuple(experiment))
+    return Attachments({} if "import" in read["scene"][0] else catalogue.table.channels, tuple(experiment))
 
 
 def _experiment(scene_document: dict[str, Any], recorded: dict[str, Any], source: Source) -> list[str]:

@@ -27,7 +27,7 @@ FAILURES = {
 INK, QUIET, ALARM = "#222222", "#777777", "#b00020"
 
 
-def look(row: Row, rows: list[Row]) -> dict[str, Any]:
+def point_style(row: Row, rows: list[Row]) -> dict[str, Any]:
     """Return the style of a method: bold in its own colour for our engines, thin in the family's colour for peers."""
     if row["family"] == RIG_FAMILY:
         own, main = traits(row["method"]), row["method"] == next(iter(ENGINES))
@@ -42,9 +42,9 @@ def look(row: Row, rows: list[Row]) -> dict[str, Any]:
             "mew": 0.5, "zorder": 5 if strong else 4}  # fmt: skip
 
 
-def look_of_bound(row: Row, rows: list[Row]) -> dict[str, Any]:
+def bound_style(row: Row, rows: list[Row]) -> dict[str, Any]:
     """Return line and marker of a library's bound, without the time of the Python loop that drives it."""
-    style = look(row, rows)
+    style = point_style(row, rows)
     return style | {"ls": (0, (1, 1.4)), "lw": 0.9, "mfc": "white", "mew": 0.8}
 
 
@@ -72,11 +72,11 @@ def draw_legend(
             continue
         entries.append((blank, headings.get(family, family)))
         for row in members:
-            style = {key: value for key, value in look(row, rows).items() if key != "zorder"}
+            style = {key: value for key, value in point_style(row, rows).items() if key != "zorder"}
             entries.append((Line2D([], [], **style), row["title"]))
             points = [one for one in rows if one["panel"] in panels and one["method"] == row["method"]]
             if bounds and any(one["own_cpu_s"] for one in points):
-                style = {key: value for key, value in look_of_bound(row, rows).items() if key != "zorder"}
+                style = {key: value for key, value in bound_style(row, rows).items() if key != "zorder"}
                 entries.append((Line2D([], [], **style), f"{row['method']} alone: a bound"))
         if smoothed and family == RIG_FAMILY:
             color, dash = traits("tsit5").colour, (0, (1, 1.4))
