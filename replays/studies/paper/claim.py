@@ -29,7 +29,7 @@ CORRECTIONS = {
 }
 """Corrections by parameter in which `corrected` differs from `as-printed`."""
 SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Factors on stiffness and damping of the houses' supports; larger ones reduce the mobility."""
+"""Factors on stiffness and damping of the housings' supports; larger ones reduce the mobility."""
 BANDWIDTHS_HZ = (50.0, 100.0, 200.0, 500.0, 1000.0, 4900.0)
 ENDS = ("low", "high")
 LAWS = ("exact", "lankarani-nikravesh", "none", "hunt-crossley", "flores", "kelvin-voigt")
@@ -83,7 +83,7 @@ def scale_supports(scale: float) -> dict[str, Any]:
 
 
 def stiffer_houses() -> dict[str, dict[str, Any]]:
-    """Return less mobile houses by name."""
+    """Return less mobile housings by name."""
     return {"× 3": scale_supports(3.0), "× 10": scale_supports(10.0), "rigid": {"model.stator": "rigid"}}
 
 

@@ -193,7 +193,7 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
     results = findings.results
 
     def stiffness_ratios(houses: Iterable[str], *quantities: str) -> np.ndarray:
-        """Return ratios of less mobile houses to the corrected ones in the same run; all are readings."""
+        """Return ratios of less mobile housings to the corrected ones in the same run; all are readings."""
         found = []
         for each in (results[f"spread {name}"] for name in houses):
             found += [column(each, name) / column(findings.spread[: len(each)], name) for name in quantities]

@@ -134,7 +134,7 @@ def _find_printed_peak(peak: Callable[[float], float], low: float, high: float) 
 
 
 class Reading(NamedTuple):
-    """A variant of the houses' masses and springs."""
+    """A variant of the housings' masses and springs."""
 
     value: float
     mode_hz: float
@@ -144,7 +144,7 @@ class Reading(NamedTuple):
 
 
 def house_numbers(results: Results) -> dict[str, Numbers]:
-    """Compare variants: 8.88 kg as the outer house or both houses (`mass`); K_ft / 2 or 2 K_ft (`pair`)."""
+    """Compare variants: 8.88 kg as the outer housing or both housings (`mass`); K_ft / 2 or 2 K_ft (`pair`)."""
     p = load_parameters("corrected")
 
     def reading(group: str, value: float, *, mass: float, link: float) -> Reading:

@@ -27,7 +27,7 @@ def peer_cells(trial: str) -> Iterator[Cell]:
 
 
 def _ring_down(name: str, tolerance: float) -> float:
-    """Return |E/E0 - 1| of the undamped house mode after 0.2 s."""
+    """Return |E/E0 - 1| of the undamped housing mode after 0.2 s."""
     constants, mode = house_oscillator()
     y0 = state(y_ih=1e-5 * mode.inner, y_oh=1e-5 * mode.outer)
     problem = _problem("ring-down", constants, quiet_inputs(), y0, 0.2)

@@ -74,9 +74,9 @@ def least_friction(own: Oscillator, whirl: float) -> float:
 
 
 def friction_with_houses(constants: Constants, spin: float) -> float:
-    """Return the least friction that sustains whirl with dissipation in the houses' beams [1].
+    """Return the least friction that sustains whirl with dissipation in the housings' beams [1].
 
-    The rotating normal force excites the inner and outer house, two masses on a line in x and in y (eqs. 22-25), at
+    The rotating normal force excites the inner and outer housing, two masses on a line in x and in y (eqs. 22-25), at
     their amplitudes of forced vibration; friction must supply the mean power of their dampers.
     """
     own = oscillator(constants)
@@ -107,10 +107,10 @@ def _ring_motion(constants: Constants, whirl: float, force: float) -> tuple[comp
 
 
 def friction_swing(constants: Constants, spin: float) -> float:
-    """Return the amplitude of the friction about its mean in a rolling whirl with moving houses [N].
+    """Return the amplitude of the friction about its mean in a rolling whirl with moving housings [N].
 
-    The houses are more compliant horizontally than vertically, so the ring's centre moves on an ellipse with half axes
-    X and Y: a circle in the direction of whirl, and one of radius |X - Y|/2 against it. Relative to the shaft, the
+    The housings are more compliant horizontally than vertically, so the ring's centre moves on an ellipse with half
+    axes X and Y: a circle in the direction of whirl, and one of radius |X - Y|/2 against it. Relative to the shaft, the
     latter rotates at twice the whirl frequency and accelerates and brakes it along the ring by m w^2 |X - Y| / 2.
     """
     own = oscillator(constants)

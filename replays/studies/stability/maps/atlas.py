@@ -1,6 +1,6 @@
 """Stability map of every engine over step and stiffness: energy of an undamped oscillator after 60 periods.
 
-Two oscillators are used: the inner house on its beam, and the shaft in the ring on a linear contact. For fixed-step
+Two oscillators are used: the inner housing on its beam, and the shaft in the ring on a linear contact. For fixed-step
 engines, theory predicts a line h w = const.
 """
 
@@ -49,7 +49,7 @@ class Map(NamedTuple):
 
 
 def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
-    """Return the energy ratio of the inner house on its undamped beam, with the outer house fixed."""
+    """Return the energy ratio of the inner housing on its undamped beam, with the outer housing fixed."""
     constants = base_model(ModelLevels(magnet="linear", shaft="planar", stator="inner-house")).constants
     house = constants.house._replace(inner_beam_damping=0.0, inner_beam_stiffness=stiffness)
     constants = constants._replace(house=house, contact=constants.contact._replace(clearance=1e200))

@@ -25,7 +25,7 @@ FIXED_STEP_ERROR = 1e-3
 _MAX_PEAK_RATIO, _MIN_PEAK_N = 20.0, 10.0
 """Ratio to the accurate peak force above which a peak is implausible, and least accurate peak for this ratio [N]."""
 UNBOUNDED_N = 1e9
-"""Accurate peak force above which the model itself generates energy, as a gap counted for both houses can [N]."""
+"""Accurate peak force above which the model itself generates energy, as a gap counted for both housings can [N]."""
 INITIAL_SHIFT = 1e-7
 """Shift of the initial position, in clearances, for testing the sensitivity."""
 CHAOS_GROWTH = 1e5
