@@ -187,7 +187,7 @@ def _spin(trace: Trace) -> float:
     return float(theta[-1] - theta[0]) / trace.settled_s / (2.0 * math.pi)
 
 
-def _dissipated_energy(trace: Trace) -> float:
+def _dissipation(trace: Trace) -> float:
     return float(sum(trace.column(name)[-1] for name in DISSIPATED))
 
 
@@ -251,7 +251,7 @@ QUANTITIES = {
         ),
         Measurand("contact_impulse", "N s", "whole run", "the engine's own integral of the normal force",
                  _read_final("contact_impulse")),
-        Measurand("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipated_energy),
+        Measurand("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipation),
         Measurand("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction),
         Measurand(
             "time_to_roll", "s", "transient", f"until it rolls for good (slip below {MAX_ROLLING_SLIP:.0%}), to 50 us",
