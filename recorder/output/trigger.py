@@ -20,7 +20,7 @@ EVENT_NAMES = (*TRIGGERS, "note", "warning")
 _LEVEL = re.compile(r"\s*(\|?)([A-Za-z_]\w*)(\|?)\s*([<>])\s*([-+.\deE]+)\s*")
 MOST_CAPTURES = 1000
 _MAX_PRE_S = 120.0
-LONGEST_S = 60.0
+MAX_CAPTURE_S = 60.0
 """Default maximum length of a capture [s of simulated time]."""
 REARM_S = 0.25
 """Time without a value beyond the level after which it triggers again [s of simulated time].
@@ -92,7 +92,7 @@ class Capture:
         again: Effect of a trigger during a capture: extend it to `post_s` after the trigger, or ignore the trigger.
             Both count it and list it in the file. None: events extend; levels are ignored, because whirl can cross a
             level again and again.
-        longest_s: Maximum length of a capture, including `pre_s` [s of simulated time]; None for `LONGEST_S`, or
+        longest_s: Maximum length of a capture, including `pre_s` [s of simulated time]; None for `MAX_CAPTURE_S`, or
             `pre_s` + `post_s` if that is longer.
     """
 
@@ -119,7 +119,7 @@ class Capture:
     @property
     def max_length_s(self) -> float:
         """Effective maximum length of a capture [s of simulated time]."""
-        return max(LONGEST_S, self.pre_s + self.post_s) if self.longest_s is None else self.longest_s
+        return max(MAX_CAPTURE_S, self.pre_s + self.post_s) if self.longest_s is None else self.longest_s
 
     def is_extended_by(self, trigger: Trigger) -> bool:
         """Return whether a trigger extends a capture in progress."""

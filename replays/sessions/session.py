@@ -25,7 +25,7 @@ COMMAND = "rig sessions -o replays/sessions --force"
 """What makes the committed ones anew."""
 _EPOCH_NS = 1_800_000_000 * 1_000_000_000
 """Wall time at which they begin, the same always: the same numbers give the same bytes."""
-_SMALL = {"sensors.truth_rate_hz": 100}
+_SMALL_FILE_CHANGES = {"sensors.truth_rate_hz": 100}
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,14 @@ def make(
 
 
 def _record(session: ReferenceSession, path: Path) -> None:
-    simulation = Simulation(load_scene(session.scene, {**_SMALL, **session.changes}))
+    simulation = Simulation(load_scene(session.scene, {**_SMALL_FILE_CHANGES, **session.changes}))
     with McapRun(path, simulation, force=True, view_rate_hz=0.0, epoch_ns=_EPOCH_NS) as writer:
         for frame in frames(simulation):
             writer.write(frame)
 
 
 def quantities_text(session: ReferenceSession, found: Validation) -> str:
-    """The quantities of a session as TOML, phase by phase, as its sensors show them (energies: the truth)."""
+    """Return the quantities of a session as TOML, by phase, as its sensors show them (energies: the truth)."""
     lines = [
         f"# Quantities of {session.name}.mcap, read off the recording; made with it by `{COMMAND}`.",
         f"# Scene {session.scene} with {', '.join(f'{key} = {value}' for key, value in session.changes.items())}.",

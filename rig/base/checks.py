@@ -30,7 +30,7 @@ TOML_BYTES = 1 << 20
 """Largest file written by a person [bytes]."""
 DEPTH = 32
 """Deepest nesting of a document."""
-LARGEST = 2**63 - 1
+MAX_INTEGER = 2**63 - 1
 """Largest whole number: the range of ticks, row numbers and seeds."""
 
 Count = Annotated[int, Field(ge=0, lt=2**62)]
@@ -192,13 +192,13 @@ def parse_toml(text: str, *, field: str) -> dict[str, Any]:
         if number is not None and "\n" in text:
             field += f", line {text.count(chr(10), 0, number.start()) + 1}"
         received = Words(printable(str(error), 100) if number is None else "one of thousands of digits")
-        raise InputError(field, f"without whole numbers beyond +-{LARGEST}", received) from None
+        raise InputError(field, f"without whole numbers beyond +-{MAX_INTEGER}", received) from None
     check_depth(document, field=field)
     return document
 
 
 def check_depth(document: Any, *, field: str) -> None:
-    """Raise an error for a document nested deeper than `DEPTH`, or with a whole number beyond `LARGEST`.
+    """Raise an error for a document nested deeper than `DEPTH`, or with a whole number beyond `MAX_INTEGER`.
 
     Raises:
         InputError: The document exceeds a limit.
@@ -206,8 +206,8 @@ def check_depth(document: Any, *, field: str) -> None:
     level = [document]
     for _ in range(DEPTH + 1):
         for item in level:
-            if isinstance(item, int) and abs(item) > LARGEST:
-                raise InputError(field, f"without whole numbers beyond +-{LARGEST}", item)
+            if isinstance(item, int) and abs(item) > MAX_INTEGER:
+                raise InputError(field, f"without whole numbers beyond +-{MAX_INTEGER}", item)
         level = [
             item
             for each in level
@@ -245,8 +245,8 @@ def _refuse_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _parse_int(digits: str) -> int:
     # Well below Python's own limit of 4300 digits, above which it raises.
-    if len(digits) > len(str(-LARGEST)) or not -LARGEST - 1 <= (number := int(digits)) <= LARGEST:
-        raise InputError("", f"without whole numbers beyond +-{LARGEST}", printable(digits, 60))
+    if len(digits) > len(str(-MAX_INTEGER)) or not -MAX_INTEGER - 1 <= (number := int(digits)) <= MAX_INTEGER:
+        raise InputError("", f"without whole numbers beyond +-{MAX_INTEGER}", printable(digits, 60))
     return number
 
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from rig.base import wire
-from rig.base.checks import LARGEST, Name, StrictModel, a_line, check, read_json
+from rig.base.checks import MAX_INTEGER, Name, StrictModel, a_line, check, read_json
 from rig.base.errors import InputError, RefusedError
 from rig.base.text import printable
 from rig.serve.transport import Server
@@ -42,8 +42,8 @@ class EmptyRequest(StrictModel):
 class StepRequest(StrictModel):
     """Length of a step of a lockstep run or a paused replay."""
 
-    ticks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
-    blocks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
+    ticks: Annotated[int, Field(gt=0, le=MAX_INTEGER)] | None = None
+    blocks: Annotated[int, Field(gt=0, le=MAX_INTEGER)] | None = None
 
 
 def _check_word(text: str) -> str:
@@ -71,9 +71,9 @@ class DoneRequest(StrictModel):
     """Report that a device has finished a block."""
 
     device: Name
-    tick: Annotated[int, Field(ge=0, le=LARGEST)] | None = None
+    tick: Annotated[int, Field(ge=0, le=MAX_INTEGER)] | None = None
     """End of the block; alternative to `block`."""
-    block: Annotated[int, Field(ge=0, le=LARGEST)] | None = None
+    block: Annotated[int, Field(ge=0, le=MAX_INTEGER)] | None = None
     """Number of the block; alternative to `tick`."""
 
     @model_validator(mode="after")

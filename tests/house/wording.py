@@ -6,6 +6,7 @@ Each pattern has a cure. The command lists the lines that match; a test limits t
 from __future__ import annotations
 
 import ast
+import functools
 import io
 import re
 import sys
@@ -27,7 +28,7 @@ VAGUE = re.compile(
     r"^_?(ABOUT|ABOVE|ABSURD|AFTER|AHEAD|ALIKE|ALONE|ANOTHER|ANYTHING|APART|AROUND|ASKED|BAD|BEFORE|BEHIND|BESIDE|BETWEEN"
     r"|BEYOND|CERTAIN|CLEARLY|CROWDED|DONE|EARLY|ELSE|ELSEWHERE|ENOUGH|EVERY|FAR|FARTHEST|FEW|FEWEST|FINE|FINER|FINEST"
     r"|FORETOLD|FOUND|GONE|GOOD|HARDLY|HELD|HERE|HOW|KEPT|LARGE|LARGEST|LATE|LATELY|LATER|LEAST|LEFT|LONG|LONGER|LONGEST"
-    r"|LOOSER|LOUD|MANY|MOST|NARROWER|NEAR|NEARLY|NEVER|NOTHING|NOW|ODD|OFTEN|ONCE|OTHER|OTHERWISE|OURS|OWN|PLAIN|PLAINER"
+    r"|LOOSER|LOUD|MANY|MOST|NARROWER|NEAR|NEARLY|NEVER|NOTHING|NOW|ODD|OFTEN|ONCE|OTHER|OTHERWISE|OURS|OWN|PLAINER"
     r"|RARE|REST|ROUGH|SAID|SAME|SEEN|SELDOM|SEVERAL|SHARPER|SHORT|SHORTEST|SHOWN|SLIGHT|SLOWER|SMALL|SMALLEST|SOME"
     r"|SOMETHING|SOONER|SPARE|STEADY|STRAY|SUDDEN|SURE|TAKEN|TELLING|TINY|TOGETHER|TOLD|UNDER|UNTOLD|USUAL|WIDE|WORSE"
     r"|WORTH)(_[A-Z]{1,3})?$"
@@ -47,42 +48,45 @@ class Finding(NamedTuple):
         return f"{self.path}:{self.line}: {self.cure}: {self.text}"
 
 
-def prose_of(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield number and text of each line of prose: docstrings and comments of a module, text of a page."""
+@functools.cache
+def prose_of(path: Path) -> tuple[tuple[int, str], ...]:
+    """Return number and text of each line of prose: docstrings and comments of a module, text of a page."""
+    return tuple((number, line.strip()) for number, line in _prose_lines(path) if line.strip())
+
+
+def _prose_lines(path: Path) -> Iterator[tuple[int, str]]:
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".md":
         in_code = False
         for number, line in enumerate(text.splitlines(), 1):
             if line.lstrip().startswith("```"):
                 in_code = not in_code
-            elif not in_code and line.strip():
-                yield number, line.strip()
+            elif not in_code:
+                yield number, line
         return
     for node in ast.walk(ast.parse(text)):
         body = getattr(node, "body", None)
         for each in body if isinstance(body, list) else ():
-            if (
-                isinstance(each, ast.Expr)
-                and isinstance(each.value, ast.Constant)
-                and isinstance(each.value.value, str)
-            ):
-                for offset, line in enumerate(each.value.value.splitlines()):
-                    if line.strip():
-                        yield each.lineno + offset, line.strip()
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type == tokenize.COMMENT and token.string.lstrip("# "):
-            yield token.start[0], token.string.lstrip("# ")
+            match each:
+                case ast.Expr(value=ast.Constant(value=str() as docstring)):
+                    yield from enumerate(docstring.splitlines(), each.lineno)
+    if "#" in text:
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type == tokenize.COMMENT:
+                yield token.start[0], token.string.lstrip("# ")
 
 
 def match_patterns(paths: Iterable[Path], patterns: dict[str, str]) -> tuple[list[Finding], int]:
     """Return the lines of prose that match a pattern, and the number of all lines of prose."""
-    compiled = [(re.compile(pattern, 0 if pattern.startswith("^") else re.IGNORECASE), cure)
+    compiled = [(re.compile(pattern if pattern.startswith("^") else f"(?i:{pattern})"), cure)
                 for pattern, cure in patterns.items()]  # fmt: skip
+    any_pattern = re.compile("|".join(pattern.pattern for pattern, _ in compiled))
     findings, lines = [], 0
     for path in paths:
         for number, line in prose_of(path):
             lines += 1
-            if cure := next((cure for pattern, cure in compiled if pattern.search(line)), ""):
+            if any_pattern.search(line):
+                cure = next(cure for pattern, cure in compiled if pattern.search(line))
                 findings.append(Finding(path, number, line, cure))
     return findings, lines
 
@@ -100,7 +104,7 @@ def check_forms(paths: Iterable[Path]) -> list[Finding]:
                 if text.split()[0].strip("`.,:;").lower() not in VERBS:
                     cure = "begin with a verb in the imperative"
                     findings.append(Finding(path, node.body[0].lineno, text.splitlines()[0], cure))
-            elif isinstance(node, ast.Assign | ast.AnnAssign):
+            elif isinstance(node, ast.Assign | ast.AnnAssign) and node.col_offset == 0:  # not the values of an enum
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
                 for target in targets:
                     if isinstance(target, ast.Name) and VAGUE.match(target.id):

@@ -171,7 +171,7 @@ class _Code:
         return item.number in self._needed and (late if again else not late or item.number in self._first)
 
     def _number_lanes(self, items: list[Node | Fork], lane: int, *, rare: bool, now: bool = False) -> int:
-        """Number the lanes from `lane` on; branches of a fork share theirs, and those of few scenes come last."""
+        """Assign numbers to the lanes from `lane` on; a fork's branches share theirs, those of few scenes are last."""
         for item in items:
             if isinstance(item, Fork):
                 sides = [
