@@ -550,6 +550,6 @@ def connect(
 
         >>> connect("can:zenoh:can0", truth=["contact"])
         Traceback (most recent call last):
-        rig.base.errors.InputError: truth must be left out over CAN, which cannot carry it; instead received ['contact']
+        rig.base.errors.InputError: truth must be left out over CAN, which cannot carry it; received ['contact']
     """
     return Rig.open(url, channels=channels, wait_s=wait_s, **settings)

@@ -80,7 +80,7 @@ class Console(Closing):
         Accepted(command='hammer', id=1, tick=2500, time_s=0.0025)
         >>> console.speed(float("nan"))
         Traceback (most recent call last):
-        rig.base.errors.InputError: speed_hz must be a finite number; instead received nan
+        rig.base.errors.InputError: speed_hz must be a finite number; received nan
     """
 
     def __init__(self, client: Client, *, name: str | None = None, timeout_s: float = 5.0) -> None:

@@ -172,7 +172,7 @@ class CanMessage:
             signal = known[name]
             low, high = signal.raw_range
             if not low <= value <= high:
-                raise ValueError(f"{self.name}.{name} must be between {low} and {high}; instead received {value}")
+                raise ValueError(f"{self.name}.{name} must be between {low} and {high}; received {value}")
             total |= (value & (1 << signal.bits) - 1) << signal.start
         return total.to_bytes(self.length, "little")
 

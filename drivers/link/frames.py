@@ -44,7 +44,7 @@ def unstuff(data: bytes) -> bytes:
         code = data[position]
         end = position + code
         if code == 0 or end > len(data):
-            raise ValueError(f"stuffed bytes must hold whole runs; instead received one of {code} at {position}")
+            raise ValueError(f"stuffed bytes must hold whole runs; received one of {code} at {position}")
         out += data[position + 1 : end]
         position = end
         if code <= _MAX_RUN and position < len(data):

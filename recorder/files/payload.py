@@ -85,7 +85,7 @@ def parse_block(key: str, payload: bytes) -> Block:
     """
     block = decode_block(payload, get_schema(key) or "")
     if not _is_sound(key, block):
-        raise ValueError(f"payload must have rows at a rate, or edges at times; instead received {key}: {block}")
+        raise ValueError(f"payload must have rows at a rate, or edges at times; received {key}: {block}")
     return block
 
 

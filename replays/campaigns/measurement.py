@@ -142,7 +142,7 @@ class Measurement:
         if self.open_reason:
             return f"{self.name} must be {self.must}; inconclusive: {self.open_reason}" + (f" [{rest}]" if rest else "")
         return (
-            f"{self.name} must be {self.must}; instead received {text}"
+            f"{self.name} must be {self.must}; received {text}"
             if not self.good
             else f"{self.name} is {text}, as it must be: {self.must}"
         ) + (f" ({self.note})" if self.note else "") + (f" [{rest}]" if rest else "")  # fmt: skip

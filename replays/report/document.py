@@ -155,7 +155,7 @@ class Report:
         whole = tuple(Row(tuple(map(printable, row.cells)), row.mark) for row in given)
         for row in whole:
             if len(row.cells) != len(headings):
-                raise ValueError(f"row must have {len(headings)} cells; instead received {row.cells}")
+                raise ValueError(f"row must have {len(headings)} cells; received {row.cells}")
         self.parts.append(Table(tuple(map(printable, headings)), whole, printable(caption)))
 
     def picture(self, figure: Figure, caption: str, *, dpi: int = DPI) -> None:

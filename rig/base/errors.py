@@ -24,7 +24,7 @@ _MAX_NAMES = 12
 class InputError(ValueError):
     """A field has an invalid value.
 
-    The message is always `FIELD must be MUST; instead received RECEIVED`, in every command, service reply and notebook.
+    The message is always `FIELD must be MUST; received RECEIVED`, in every command, service reply and notebook.
     The command line prints it on one line and exits with status 2. RECEIVED is a value, which is quoted, or `Words`
     about it.
 
@@ -32,7 +32,7 @@ class InputError(ValueError):
         >>> import rig
         >>> rig.load_scene("hammer", {"duration_s": -1})
         Traceback (most recent call last):
-        rig.base.errors.InputError: duration_s must be greater than 0; instead received -1
+        rig.base.errors.InputError: duration_s must be greater than 0; received -1
     """
 
     def __init__(self, field: str, must: str, received: object) -> None:
@@ -40,7 +40,7 @@ class InputError(ValueError):
         self.field = field
         self.must = must
         self.received = received
-        super().__init__(printable(f"{field} must be {must}; instead received {format_value(received)}", _MAX_LINE))
+        super().__init__(printable(f"{field} must be {must}; received {format_value(received)}", _MAX_LINE))
 
 
 class UnknownNameError(InputError, KeyError):
@@ -52,7 +52,7 @@ class UnknownNameError(InputError, KeyError):
         ...     rig.simulate("hammer", duration_s=0.01).samples["disk_z"]
         ... except KeyError as error:
         ...     print(error)
-        name must be one of the existing names, such as disk_y, disk_x (15 in all); instead received 'disk_z'
+        name must be one of the existing names, such as disk_y, disk_x (15 in all); received 'disk_z'
     """
 
     def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:

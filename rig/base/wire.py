@@ -138,7 +138,7 @@ def encode_block(block: Block) -> bytes:
     """Return a block as a CDR message; the schema follows from the dtype of its values."""
     values = np.ascontiguousarray(block.values)
     if values.dtype not in (_DTYPES[SAMPLE_SCHEMA], _DTYPES[TRUTH_SCHEMA]) or values.ndim != 2 or not values.shape[1]:
-        raise TypeError(f"values must be int32 or float64 in columns; instead received {values.dtype}, {values.shape}")
+        raise TypeError(f"values must be int32 or float64 in columns; received {values.dtype}, {values.shape}")
     head = _HEAD.pack(block.tick, block.index, block.rate_hz, block.tick_rate_hz, values.shape[1], values.size)
     return b"".join((_ENCAPSULATION, head, values.tobytes()))
 
@@ -157,11 +157,11 @@ def decode_block(payload: bytes, schema: str) -> Block:
     dtype = _DTYPES[schema]
     start = len(_ENCAPSULATION) + _HEAD.size
     if len(payload) < start or payload[:4] != _ENCAPSULATION:
-        raise ValueError(f"payload must be a {schema} message; instead received {len(payload)} other bytes")
+        raise ValueError(f"payload must be a {schema} message; received {len(payload)} other bytes")
     tick, index, rate_hz, tick_rate_hz, columns, size = _HEAD.unpack_from(payload, len(_ENCAPSULATION))
     if columns == 0 or size % columns or len(payload) != start + size * dtype.itemsize:
         raise ValueError(
-            f"payload must hold whole rows of {columns} values, {size} in all; instead received {len(payload)} bytes"
+            f"payload must hold whole rows of {columns} values, {size} in all; received {len(payload)} bytes"
         )
     rows = size // columns
     if not (
@@ -173,7 +173,7 @@ def decode_block(payload: bytes, schema: str) -> Block:
     ):
         raise ImplausibleError(
             "payload must have times and numbers that a clock can have; "
-            f"instead received {rows} rows from {index} on at tick {tick}, {rate_hz} Hz of {tick_rate_hz} Hz"
+            f"received {rows} rows from {index} on at tick {tick}, {rate_hz} Hz of {tick_rate_hz} Hz"
         )
     values = np.frombuffer(payload, dtype, offset=start).reshape(-1, columns)
     return Block(tick=tick, index=index, rate_hz=rate_hz, tick_rate_hz=tick_rate_hz, values=values)

@@ -185,7 +185,7 @@ def test_cylinders_add_up(geometry: MagnetGeometry) -> None:
 
 
 def test_places_beyond_the_reach_are_refused() -> None:
-    with pytest.raises(InputError, match=r"displacement must be within the reach of 10 mm; instead received '?10\.1"):
+    with pytest.raises(InputError, match=r"displacement must be within the reach of 10 mm; received '?10\.1"):
         cylinder_force(np.array([10.1e-3]), np.zeros(1), TABLE_1)
 
 

@@ -112,9 +112,7 @@ INPUTS = Inputs(1e-6, 0.0, 1.0, 0.0, 0, 0, 0.0, 0.0, 0, ideal_drive=False, magne
 
 def test_collocation_is_the_default_of_split_only() -> None:
     assert load_scene("hammer").engine.rolling == "collocation"
-    with pytest.raises(
-        InputError, match=r"engine.rolling must be series with engine rk8; instead received 'collocation'"
-    ):
+    with pytest.raises(InputError, match=r"engine.rolling must be series with engine rk8; received 'collocation'"):
         load_scene("hammer", {"engine.name": "rk8", "engine.rolling": "collocation"})
     for rolling, size in (("collocation", layout.MEMORY), ("series", MEMORY)):
         simulation = Simulation(load_scene("hammer", {"engine.rolling": rolling}))

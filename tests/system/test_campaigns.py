@@ -125,15 +125,15 @@ def test_a_device_in_lockstep_gets_the_same_verdict_each_time(folder: Path) -> N
     assert measurements["time to trip"]["good"]
     assert measurements["time to trip"]["resolution"] == "1 tick, 1 us; 10 ms blocks, in lockstep"
     assert 1e3 * measurements["time to trip"]["at_s"] % 10.0 == 0.0  # the end of a block
-    assert "exit status of protection must be == 0; instead received 1 (its last line: out of order)" in out
-    assert "\n      time to trip must be <= 20 ms; instead received nothing (no note tags=trip occurred)" in out
+    assert "exit status of protection must be == 0; received 1 (its last line: out of order)" in out
+    assert "\n      time to trip must be <= 20 ms; received nothing (no note tags=trip occurred)" in out
     assert dies["reason"].startswith("exit status of protection must be == 0")
     assert [each["good"] for each in fixtures["measurements"]] == [True, True, False]
-    assert fixtures["reason"].startswith("force must be <= 1 N; instead received ")
+    assert fixtures["reason"].startswith("force must be <= 1 N; received ")
     assert fixtures["resolution"] == "20 ms blocks, in lockstep"
     # A rig that was stopped for a tenth of a second gives no verdict on a device.
     assert behind["reason"].startswith("not judged because the rig was late in ")
-    assert behind["reason"].partition(": ")[2].startswith("time to trip must be <= 1 ms; instead received 2 ms")
+    assert behind["reason"].partition(": ")[2].startswith("time to trip must be <= 1 ms; received 2 ms")
     # The evidence of the failed case, about the moment of the failure.
     logs = folder / "out/evidence/test_x.py_test_fixtures"
     assert [Path(file).name for file in fixtures["evidence"]] == ["rig.log", "watcher.log", "event.mcap", "event.png"]
@@ -230,7 +230,7 @@ def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(tm
     run_campaign(tmp_path, "test_open.py", "-k", "test_skip", status=3)
     run_campaign(tmp_path, "test_open.py", "-k", "test_pass", status=0)
     _, document = run_campaign(tmp_path, "test_open.py", status=1)
-    assert document["cases"][2]["reason"].startswith("gap must be <= 1 mm; instead received 2 mm")
+    assert document["cases"][2]["reason"].startswith("gap must be <= 1 mm; received 2 mm")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml=plain.xml", "test_open.py"]
     found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert "1 failed, 1 passed, 1 skipped, 1 error" in found.stdout, found.stdout + found.stderr

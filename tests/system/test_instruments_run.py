@@ -87,7 +87,7 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
                     force.append(daq.read(20))
                 peak = max(each["hammer"].max() for each in force)
                 assert peak == pytest.approx(200.0, rel=0.02)
-                with pytest.raises(RefusedError, match=r"force_n must be .*1000.*; instead received 5000"):
+                with pytest.raises(RefusedError, match=r"force_n must be .*1000.*; received 5000"):
                     hammer.trigger(force_n=5000.0)
             with Drive.open(urls["drive"][0]) as drive:
                 assert drive.set_speed(5.0).time_s > done.time_s

@@ -76,7 +76,7 @@ def test_ctrl_c_ends_the_run_in_good_order(number: signal.Signals) -> None:
         ),
         (("hammer", "--listen", "7999"), "--listen must be HOST:PORT"),
         (("hammer", "--block-ms", "0.3"), "--block-ms must be a positive whole multiple of"),
-        (("hammer", "--block-ms", "nan"), "--block-ms must be a number; instead received nan"),
+        (("hammer", "--block-ms", "nan"), "--block-ms must be a number; received nan"),
         (("hammer", "--block-ms", "-10"), "--block-ms must be a positive whole multiple of"),
         (("hammer", "--set", "drive.speed_hz"), "--set must be KEY=VALUE"),
         (("nowhere",), "scene must be one of"),

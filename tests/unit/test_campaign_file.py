@@ -108,7 +108,7 @@ WRONG = {
     "missing program": (
         HEAD + '[device]\ncommand = "protction {url}"\n' + PEAK,
         4,
-        "device.command must be a program that there is; instead received 'protction'",
+        "device.command must be a program that there is; received 'protction'",
     ),
     "missing script": (HEAD + '[device]\ncommand = "python protction.py"\n' + PEAK, 4, "whose script is there"),
     "unknown place": (
@@ -124,12 +124,12 @@ WRONG = {
     "limit that is a number": (
         HEAD + "[limits]\ndanger = 2\n" + PEAK,
         4,
-        "limits.danger must be a number with its unit as a text, such as '0.2 mm'; instead received 2",
+        "limits.danger must be a number with its unit as a text, such as '0.2 mm'; received 2",
     ),
     "name of a device": (
         HEAD + '[device]\ncommand = "python -m json.tool"\nname = " "\n' + PEAK,
         5,
-        "device.name must be 1 to 50 letters, digits, dots, dashes and underscores; instead received ' '",
+        "device.name must be 1 to 50 letters, digits, dots, dashes and underscores; received ' '",
     ),
     "place in another unit": (
         HEAD + '[limits]\ndanger = "2 mm"\n[device]\ncommand = "python -m json.tool {danger:N}"\n' + PEAK,
@@ -151,12 +151,12 @@ WRONG = {
         3,
         "expect must be about one of signal, event, order, score",
     ),
-    "about two things": (HEAD + PEAK + 'event = "hammer"\n', 3, "instead received signal and event"),
+    "about two things": (HEAD + PEAK + 'event = "hammer"\n', 3, "received signal and event"),
     "no level": (HEAD + PEAK + 'take = "first beyond"\n', 3, "expect.beyond must be given"),
     "orbit of two units": (
         HEAD + PEAK.replace('"disk_x"', '["disk_x", "P_E"]'),
         4,
-        "two of one unit; instead received disk_x in mm and P_E in N",
+        "two of one unit; received disk_x in mm and P_E in N",
     ),
     "when of no axis": (
         HEAD + PEAK + 'when = { vote = "1oo2" }\n',

@@ -181,8 +181,7 @@ def test_a_run_stopped_early_fails_unless_expected(tmp_path: Path) -> None:
 
     (line,) = told(stop, end)
     assert line == (
-        "end of the run must be >= 0.5 s; instead received 0.01 s (stopped by guard, before the case was over)"
-        " [margin -0.49 s]"
+        "end of the run must be >= 0.5 s; received 0.01 s (stopped by guard, before the case was over) [margin -0.49 s]"
     )
     assert told(stop, end, event="note") == [line]
     assert told(stop, end, event="end") == told(stop, end, event="command", where={"command": "stop"}) == []
@@ -294,7 +293,7 @@ def test_junit_follows_its_schema(tmp_path: Path) -> None:
     assert properties["peak.note"] == "a <note>"  # without the characters that XML excludes
     failure = bad.find("testcase/failure")
     assert failure is not None
-    assert str(failure.get("message")).startswith("peak must be <= 1 mm; instead received 1.25 mm (a <note>")
+    assert str(failure.get("message")).startswith("peak must be <= 1 mm; received 1.25 mm (a <note>")
     assert good.find("testcase/system-out") is not None
     assert skipped.get("skipped") == "1"
     assert broken.get("errors") == "1"

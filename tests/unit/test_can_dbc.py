@@ -56,7 +56,7 @@ def test_an_overloaded_bus_is_refused_in_one_line(tmp_path: Path, capsys: pytest
     path.write_text(f"[groups.forces]\nchannels = [{more}]")
     warning = (
         "rig: warning: CAN load must be at most 70 % of 1M with classic frames, to leave room for other nodes; "
-        "instead received 80.7 % with 6 frames an instant (a lower --can-rate or --can-fd helps)\n"
+        "received 80.7 % with 6 frames an instant (a lower --can-rate or --can-fd helps)\n"
     )
     for command in (["can", "load"], ["can", "dbc"]):
         assert run_captured(capsys, *command, "--channels", str(path))[2] == warning

@@ -326,8 +326,8 @@ def test_arrays_and_single_frames_agree():
     ("frame", "why"),
     [
         (Frame(0x800), "more than 11 bits"),
-        (Frame(-1), "instead received -1"),
-        (Frame(1 << 29, extended=True), "instead received 536870912"),
+        (Frame(-1), "received -1"),
+        (Frame(1 << 29, extended=True), "received 536870912"),
         (Frame(0, bytes(9)), "9 bytes in a classic frame"),
         (Frame(0, bytes(9), fd=True), "not a CAN FD length"),
         (Frame(0, bytes(65), fd=True), "not a CAN FD length"),

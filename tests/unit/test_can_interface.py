@@ -755,7 +755,7 @@ def test_requests_are_strict(name: str, document: dict[str, Any], field: str) ->
     with Rig("process", "1M") as rig:
         answer = wire.decode_document(rig.hub.reply(name, wire.encode_document(document)))
         assert answer["field"] == field
-        assert answer["error"].startswith(f"{field} must be {answer['must']}; instead received")
+        assert answer["error"].startswith(f"{field} must be {answer['must']}; received")
         assert rig.hub.status()["counts"]["refused"] == 1
 
 

@@ -160,7 +160,7 @@ def test_an_absent_channel_is_no_value() -> None:
 
 
 def test_a_value_beyond_its_bits_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"Heartbeat.beat must be between 0 and 255; instead received 256"):
+    with pytest.raises(ValueError, match=r"Heartbeat.beat must be between 0 and 255; received 256"):
         TABLE.by_name["Heartbeat"].encode(beat=256)
 
 
@@ -221,7 +221,7 @@ def test_each_kind_of_invalid_command_has_its_result() -> None:
 @pytest.mark.parametrize(
     ("kind", "values", "line"),
     [
-        (CommandKind.SPEED, {}, "speed_hz must be a value for SPEED from 0 to 16777.2 Hz; instead received nothing"),
+        (CommandKind.SPEED, {}, "speed_hz must be a value for SPEED from 0 to 16777.2 Hz; received nothing"),
         (
             CommandKind.SPEED,
             {"speed_hz": 5.0, "force_n": 10.0},

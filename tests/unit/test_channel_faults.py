@@ -74,7 +74,7 @@ def test_every_number_of_a_kind_is_an_option() -> None:
 def test_an_unknown_parameter_is_refused_with_the_known_ones(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     """The rig, and the command without a rig, refuse it; the line names the number, or option, and the kind."""
     takes = [name for name in KINDS[kind].model_fields if name != "kind"]
-    words = f"must be left out: {kind} takes {', '.join(takes) or 'no numbers'}; instead received "
+    words = f"must be left out: {kind} takes {', '.join(takes) or 'no numbers'}; received "
     others = {field for each in KINDS.values() for field in each.model_fields} - {*takes, "kind"}
     for name in others:
         with pytest.raises(InputError) as caught:

@@ -168,7 +168,7 @@ def test_unknown_field_in_a_row_is_refused() -> None:
         (
             'sensitivity_v = 7.87, label = "Shaft in the ring, horizontal',
             'label = "Shaft in the ring, horizontal',
-            "rig: channel ring_x.sensitivity_v must be given; instead received nothing",
+            "rig: channel ring_x.sensitivity_v must be given; received nothing",
         ),
         (
             'signal = "ring_x"',
@@ -207,7 +207,7 @@ def test_every_command_reports_a_wrong_table_in_one_line(
 
 
 def test_a_channel_without_sensitivity_or_signal_is_refused_in_one_line() -> None:
-    with pytest.raises(InputError, match=r"channel c\.sensitivity_v must be given; instead received nothing"):
+    with pytest.raises(InputError, match=r"channel c\.sensitivity_v must be given; received nothing"):
         parse_table(one_channel().replace("sensitivity_v", "# "))
     table = parse_table(one_channel().replace('"disk_x"', '"endx"'))
     must = r"channel c\.signal must be one of the model's, such as .*received 'endx'"

@@ -259,7 +259,7 @@ def test_a_command_survives_its_can_frame(name: str) -> None:
     assert found.kind is CommandKind[name.upper()]
     assert found.values == pytest.approx({**values, **degrees})
     for field in words:
-        with pytest.raises(InputError, match=f"{field} must be x, y, -x, -y, or an angle; instead received 'z'"):
+        with pytest.raises(InputError, match=f"{field} must be x, y, -x, -y, or an angle; received 'z'"):
             command_frame(CommandKind[name.upper()], 7, **values, **{field: "z"})
 
 

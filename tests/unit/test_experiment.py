@@ -84,7 +84,7 @@ def test_a_recording_without_a_method_for_rolling_was_made_by_series() -> None:
     now = document["engine"]
     before = {key: value for key, value in now.items() if key != "rolling"}
     assert (rolling(now), rolling(before), rolling({"name": "rk8"})) == ("collocation", "series", "series")
-    with pytest.raises(InputError, match=r"engine must be a table of named fields; instead received 'split'"):
+    with pytest.raises(InputError, match=r"engine must be a table of named fields; received 'split'"):
         rolling("split")
 
 

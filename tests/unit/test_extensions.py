@@ -196,7 +196,7 @@ def test_errors_in_an_external_package_are_one_line(package: Path) -> None:
         "mute (my_wrong.mute:ROW cannot be loaded: Mute)",
         "text (my_formats.raw:RAW has a name that is in use)",
         "twice (.raw is the ending of another format)",
-        "number (my_wrong.formats:NUMBER: module must be a valid string; instead received 3)",
+        "number (my_wrong.formats:NUMBER: module must be a valid string; received 3)",
         "endless (my_wrong.formats:ENDLESS: suffixes must be a value of at least 1 item",
         "loud (my_wrong.formats:LOUD: suffixes.0 must be an ending in lower case such as .raw",
         "ours (.csv is the ending of another format)",
@@ -204,13 +204,13 @@ def test_errors_in_an_external_package_are_one_line(package: Path) -> None:
         assert words in unknown
     lines = [line.replace(f"{package}/", "") for line in lines]
     missing = "which fails: ModuleNotFoundError: No module named 'my_wrong.missing'"
-    must = "engine.name must be an engine that can be loaded; instead received own, of which"
+    must = "engine.name must be an engine that can be loaded; received own, of which"
     assert lines == [
         f"nowhere files need my_wrong.missing, {missing}",
         "empty files need my_wrong.exits, which fails: SystemExit: no licence",
-        "file must be an intact reader file; instead received a.rd "
+        "file must be an intact reader file; received a.rd "
         "(TypeError: my_wrong.reader.look_into returns NoneType, not Source)",
-        "file must be an intact reader file; instead received b.rd (SystemExit: no licence)",
+        "file must be an intact reader file; received b.rd (SystemExit: no licence)",
         "writer files need Writer in my_wrong.reader, which lacks it",
         f"{must} my_wrong.missing fails: ModuleNotFoundError: No module named 'my_wrong.missing'",
         f"{must} my_wrong.exits fails: SystemExit: no licence",

@@ -450,7 +450,7 @@ def test_one_row_is_exported_and_zero_rows_are_refused(suffix: str, recording: R
                 writer.write(key, payload, 0)
     _, summary = written(Recording.open(tmp_path / "1.mcap"), tmp_path / f"x{suffix}")
     assert summary[0].tables[0][2] == 1
-    with pytest.raises(InputError, match=r"^file must be a recording with samples; instead received '.*0\.mcap'"):
+    with pytest.raises(InputError, match=r"^file must be a recording with samples; received '.*0\.mcap'"):
         written(Recording.open(tmp_path / "0.mcap"), tmp_path / f"y{suffix}")
     with pytest.raises(InputError, match=r"^file must be a recording with two samples of a channel"):
         validate(Recording.open(tmp_path / "1.mcap"))
@@ -487,7 +487,7 @@ def test_a_failed_export_leaves_no_file(suffix: str, recording: Recording, tmp_p
         (["-o", "x.csv", "--channels", "truth.state.foo"], "--channels must be truth.state.COLUMN with one of "),
         (["-o", "x.csv", "--unit", "mils"], "--unit must be engineering, volts or counts"),
         (["-o", "x.csv", "--method", "magic"], "--method must be polyphase or linear"),
-        (["-o", "x.csv", "--from", "5"], "range must be in the recording, 0 to 0.11995 s; instead received 'from 5 s'"),
+        (["-o", "x.csv", "--from", "5"], "range must be in the recording, 0 to 0.11995 s; received 'from 5 s'"),
         (["-o", "x.csv", "--from", "0.1", "--to", "0.05"], "--to must be after --from 0.1"),
         (["-o", "x.csv", "--rate-hz", "0"], "--rate-hz must be between 1 and 1e6"),
         (["-o", "x.tdms", "--rate-hz", "1000", "--unit", "counts"], "--unit must be engineering or volts"),

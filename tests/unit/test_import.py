@@ -912,7 +912,7 @@ def test_damaged_files_are_refused_in_one_line(
 @pytest.mark.parametrize("name", ["log.csv", "log.wav"])
 def test_a_pipe_is_no_log_and_is_not_waited_for(name: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / name)
-    with pytest.raises(InputError, match=r"^file must be a file that can be read; instead received .*not a regular"):
+    with pytest.raises(InputError, match=r"^file must be a file that can be read; received .*not a regular"):
         open_source(tmp_path / name, FileOptions())
 
 
@@ -958,7 +958,7 @@ def test_a_truncated_file_is_refused_in_one_line(
 
 def test_an_unknown_group_is_reported(daq_mdf: Path, tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text("[channels.disk_y]\nsource = 'Speed'\ngroup = 'sluggish'\n")
-    with pytest.raises(InputError, match=r"disk_y\.group must be one of Fast, Slow; instead received 'sluggish'"):
+    with pytest.raises(InputError, match=r"disk_y\.group must be one of Fast, Slow; received 'sluggish'"):
         convert([daq_mdf], mappings.load_mapping(tmp_path / "m.toml"))
 
 

@@ -199,13 +199,13 @@ def test_channels_and_a_slower_rate_can_be_chosen(bench: Bench) -> None:
 
 def test_an_invalid_configuration_is_refused(bench: Bench) -> None:
     driver = bench.open("force")
-    with pytest.raises(RefusedError, match="rate_hz must be 20000 divided by a whole number; instead received 3000"):
+    with pytest.raises(RefusedError, match="rate_hz must be 20000 divided by a whole number; received 3000"):
         driver.configure(rate_hz=3000.0)
     with pytest.raises(RefusedError, match="finite"):
         driver.configure(rate_hz=float("nan"))
     with pytest.raises(RefusedError, match="rate_hz"):
         driver.configure(rate_hz=-1.0)
-    with pytest.raises(InputError, match="channel must be one of P_N, P_S, P_E, P_W; instead received 'disk_x'"):
+    with pytest.raises(InputError, match="channel must be one of P_N, P_S, P_E, P_W; received 'disk_x'"):
         driver.configure(channels=["disk_x"])
     with pytest.raises(InputError, match="rows must be at least 1"):
         driver.read(0)
@@ -232,7 +232,7 @@ def test_commands_are_acknowledged_with_their_time_or_refused_with_the_rigs_text
     done = act(driver)
     assert (done.id, done.tick, done.time_s) == (1, 1000, 1e-3)
     assert bench.rig.commands == [request]
-    bench.rig.refusal = "force_n must be from 1 to 1000; instead received 5000"
+    bench.rig.refusal = "force_n must be from 1 to 1000; received 5000"
     with pytest.raises(RefusedError) as caught:
         act(driver)
     assert str(caught.value) == bench.rig.refusal
@@ -524,10 +524,10 @@ def test_no_bytes_are_more_than_a_protocol_error_to_a_codec(memory_bench: Bench,
 def test_a_wrong_version_and_a_wrong_length_are_named() -> None:
     codec = KINDS["drive"].CODEC
     good = codec.encode(protocol.Start(), 9)
-    with pytest.raises(ProtocolError, match="version must be 1; instead received 2") as caught:
+    with pytest.raises(ProtocolError, match="version must be 1; received 2") as caught:
         codec.decode(b"\x02" + good[1:])
     assert (caught.value.reason, caught.value.sequence) == (protocol.Reason.VERSION, 9)
-    with pytest.raises(ProtocolError, match="Start must be 7 bytes long; instead received 8"):
+    with pytest.raises(ProtocolError, match="Start must be 7 bytes long; received 8"):
         codec.decode(good + b"\0")
     with pytest.raises(ProtocolError, match="at least 7 bytes"):
         codec.decode(good[:6])
@@ -571,7 +571,7 @@ def test_a_second_host_ends_the_stream_of_the_first() -> None:
     ],
 )  # fmt: skip
 def test_invalid_input_is_refused_in_one_line(url: str) -> None:
-    with pytest.raises(InputError, match=r"must be .*; instead received") as caught:
+    with pytest.raises(InputError, match=r"must be .*; received") as caught:
         open_link(url, Address("hammer", 4))
     assert "\n" not in str(caught.value)
 

@@ -369,7 +369,7 @@ def test_wrong_input_is_refused_in_one_line(
 
 def test_a_quantity_at_rounding_level_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(capsys, "ladder", "drop", "-q", "spin", "-t", "1", "--set", "duration_s=0.1")
-    assert "--quantity must be one that two accurate engines agree on in scene drop; instead received 'spin'" in line
+    assert "--quantity must be one that two accurate engines agree on in scene drop; received 'spin'" in line
 
 
 def test_parse_quantities_gives_each_its_tolerance() -> None:

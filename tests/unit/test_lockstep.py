@@ -125,7 +125,7 @@ def test_a_device_that_reports_a_future_block_is_removed(end_tick: int) -> None:
         device.wait(1)
         with pytest.raises(
             RefusedError,
-            match=rf"done must be with tick {BLOCK}, the end of the last block \(1\); instead received tick {end_tick}",
+            match=rf"done must be with tick {BLOCK}, the end of the last block \(1\); received tick {end_tick}",
         ):
             device.done(end_tick)
         (reply,) = steps.join()
@@ -190,7 +190,7 @@ def test_a_stop_does_not_wait_for_devices() -> None:
         ("join", {"device": "b\n"}, "join.device must be a line of 1 to 100 printable characters"),
         ("join", {"device": "  "}, "join.device must be a line of 1 to 100 printable characters, not all blank"),
         ("join", {}, "join.device must be given"),
-        ("done", {"device": "b", "tick": 0}, "done.device must be one that has joined; instead received 'b'"),
+        ("done", {"device": "b", "tick": 0}, "done.device must be one that has joined; received 'b'"),
         ("done", {"device": "a", "tick": -1}, "done.tick must be greater than or equal to 0"),
         ("done", {"device": "a", "tick": 1.0}, "done.tick must be a valid integer"),
         ("done", {"device": "a"}, "done must be given by either a tick or a block"),

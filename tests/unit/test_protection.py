@@ -65,7 +65,7 @@ def test_another_stream_is_refused() -> None:
     monitor = sound().Protection(protection_scenarios.settings())
     rows = protection_scenarios.samples(disk_x=0.0, disk_y=0.0)
     monitor.feed(rows)
-    with pytest.raises(InputError, match="rate_hz must be 1000 Hz as before; instead received 2000"):
+    with pytest.raises(InputError, match="rate_hz must be 1000 Hz as before; received 2000"):
         monitor.feed(replace(rows, rate_hz=2000.0))
     with pytest.raises(InputError, match="unit of disk_x must be"):
         monitor.feed(replace(rows, index=1, units=("N", "mm")))

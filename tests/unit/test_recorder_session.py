@@ -572,7 +572,7 @@ def test_without_a_trigger_nothing_is_counted_as_recorded(path):
 
 
 def test_rotation_and_triggers_together_are_refused_by_name(path):
-    with pytest.raises(InputError, match=r"^rotate_mb must be omitted .* around triggers; instead received 5\.0$"):
+    with pytest.raises(InputError, match=r"^rotate_mb must be omitted .* around triggers; received 5\.0$"):
         RecordingSession(
             ScriptedClient(), path, capture=Capture((Trigger.parse("hammer"),)), limits=DiskLimits(rotate_mb=5.0)
         )

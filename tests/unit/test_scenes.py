@@ -321,7 +321,7 @@ def test_valid_commands(name: str, request_: dict[str, Any], command: object) ->
 
 
 def test_a_request_cannot_become_another_command() -> None:
-    with pytest.raises(InputError, match=r"speed\.command must be 'speed'; instead received 'release'"):
+    with pytest.raises(InputError, match=r"speed\.command must be 'speed'; received 'release'"):
         check_command("speed", {"speed_hz": 1.0, "command": "release"})
 
 

@@ -191,7 +191,7 @@ def test_a_command_is_answered_with_its_tick_and_becomes_an_event() -> None:
         ("note", b'{"text": "a\\u001b[2Jb"}', "note.text must be a line of 1 to 1000 printable characters"),
         ("note", b'{"text": "a", "tags": ["b c"]}', "note.tags.0 must be a word"),
         ("hammer", b" " * 10_001, "at most 10000 bytes"),
-        ("hammer", b'{"force_n": 1e6}', "force_n must be above 0 and at most 1000; instead received 1000000.0"),
+        ("hammer", b'{"force_n": 1e6}', "force_n must be above 0 and at most 1000; received 1000000.0"),
         ("hammer", b"{}", "hammer must be readable"),
         ("hammer", b'{"force_n": "much"}', "hammer must be readable"),
         ("hammer", b'{"from": 7, "force_n": 1}', "from must be a valid string"),
@@ -223,7 +223,7 @@ def test_the_console_raises_the_rigs_own_line() -> None:
     with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
         with pytest.raises(RefusedError) as caught:
             rig.console.hammer(force_n=5000.0)
-        assert str(caught.value) == "force_n must be above 0 and at most 1000; instead received 5000.0"
+        assert str(caught.value) == "force_n must be above 0 and at most 1000; received 5000.0"
         with pytest.raises(InputError, match="speed_hz must be a finite number"):
             rig.console.speed(float("nan"))
 
@@ -231,7 +231,7 @@ def test_the_console_raises_the_rigs_own_line() -> None:
 def test_step_is_refused_outside_lockstep() -> None:
     with (
         Running(FakeSimulation(duration_s=None), RealTime()) as rig,
-        pytest.raises(RefusedError, match="--pace lockstep; instead received --pace real-time"),
+        pytest.raises(RefusedError, match="--pace lockstep; received --pace real-time"),
     ):
         rig.console.step(BLOCK)
 

@@ -48,7 +48,7 @@ def test_a_host_other_than_loopback_must_be_allowed_by_name() -> None:
 
 
 def test_a_port_in_use_is_refused_in_one_line(server: ZenohServer) -> None:
-    with pytest.raises(InputError, match=r"listen must be a free address .*instead received '127\.0\.0\.1") as caught:
+    with pytest.raises(InputError, match=r"listen must be a free address .*received '127\.0\.0\.1") as caught:
         ZenohServer(server.endpoint)
     assert "\n" not in str(caught.value)
 

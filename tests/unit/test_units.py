@@ -101,7 +101,7 @@ def test_every_unit_of_the_table_is_found_by_its_own_name() -> None:
 def test_an_ambiguous_spelling_is_no_unit_and_the_choices_are_named(text: str, choices: str) -> None:
     assert not units.is_known(text)
     assert units.get_quantity(text) == ""
-    with pytest.raises(InputError, match=f"x must be unambiguous: {choices}; instead received '{text}'"):
+    with pytest.raises(InputError, match=f"x must be unambiguous: {choices}; received '{text}'"):
         units.parse(text, field="x")
     with pytest.raises(InputError, match="unambiguous"):
         units.factor(text, "mm", field="x")
@@ -125,7 +125,7 @@ def test_a_detectors_suffix_must_be_explained_and_is_never_dropped(text: str, un
     "text", ["bananas", "counts", "%", "peak", "_", "*", "x", "kk", "dB", "bananas rms", "M pk-pk"]
 )
 def test_an_unknown_unit_is_refused_with_its_spelling(text: str) -> None:
-    with pytest.raises(InputError, match=r"x must be a known unit.*instead received"):
+    with pytest.raises(InputError, match=r"x must be a known unit.*received"):
         units.parse(text, field="x")
 
 
@@ -211,13 +211,13 @@ def test_factors_between_units_are_ratios_of_their_sizes() -> None:
 def test_an_unconvertible_unit_is_refused_with_valid_ones() -> None:
     with pytest.raises(InputError, match="x must be bananas, the unit of the channel, which has no conversion"):
         units.factor("mm", "bananas", field="x")
-    with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\); instead received 'N'"):
+    with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\); received 'N'"):
         units.factor("N", "mm", field="x")
     with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\), with a sensitivity; instead"):
         units.factor("mV", "mm", field="x")
     with pytest.raises(InputError, match=r"one of m, cm, .*, or V or mV with a sensitivity \(such as thou\)"):
         units.factor("thou2", "mm", field="x")
-    with pytest.raises(InputError, match=r"or V or mV with a sensitivity; instead received 'bananas'"):
+    with pytest.raises(InputError, match=r"or V or mV with a sensitivity; received 'bananas'"):
         units.factor("bananas", "mm", field="x")
 
 

@@ -107,7 +107,7 @@ def test_the_first_matching_criterion_applies() -> None:
 def test_missing_data_are_reported_as_missing(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text("[window]\nlongest_s = 1.0\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"^own\.toml\.title must be given; instead received nothing$"):
+    with pytest.raises(InputError, match=r"^own\.toml\.title must be given; received nothing$"):
         load_criteria(path)
 
 

@@ -85,7 +85,7 @@ def test_a_value_of_another_type_is_shown(words: list[str], field: str, capsys: 
     assert ended.value.code == 2
     errors = capsys.readouterr().err
     assert errors.startswith(f"rig: {field}")
-    assert errors.endswith("must be a valid number; instead received 'abc'\n")
+    assert errors.endswith("must be a valid number; received 'abc'\n")
 
 
 def test_a_key_readable_by_others_is_refused(tmp_path: Path) -> None:
@@ -98,5 +98,5 @@ def test_a_key_readable_by_others_is_refused(tmp_path: Path) -> None:
 
 def test_a_quoted_number_is_refused() -> None:
     assert parse_scene({"duration_s": 1}).duration_s == 1.0
-    with pytest.raises(InputError, match="duration_s must be a number; instead received '1'"):
+    with pytest.raises(InputError, match="duration_s must be a number; received '1'"):
         parse_scene({"duration_s": "1"})

@@ -208,7 +208,7 @@ def decode(payload: bytes) -> HubMessage:
         CodecError: The payload is not a message of this bus.
     """
     if len(payload) < _HEADER.size:
-        raise CodecError(f"a message must have a header; instead received {len(payload)} bytes")
+        raise CodecError(f"a message must have a header; received {len(payload)} bytes")
     magic, kind, width, count = _HEADER.unpack_from(payload)
     if magic != _MAGIC or kind not in (FRAMES, REPORTS):
         raise CodecError("the header must be one of this bus")

@@ -141,7 +141,7 @@ class NodeBus(can.BusABC):
         for name, requested in self._rates.items():
             if requested is not None and rates[name] is not None and requested != rates[name]:
                 raise can.CanInitializationError(
-                    f"{name} must be that of {self._where()}, {rates[name]}; instead received {requested}"
+                    f"{name} must be that of {self._where()}, {rates[name]}; received {requested}"
                 )
         if self._fd_asked and not answer.fd:
             raise can.CanInitializationError(f"{self._where()} has a bus for classic CAN only; fd=True asks for CAN FD")
@@ -337,7 +337,7 @@ class NodeBus(can.BusABC):
     def state(self, new_state: BusState) -> None:
         """Set the state: ACTIVE takes part (also after bus-off), PASSIVE only listens."""
         if new_state not in _LISTEN_ONLY:
-            raise can.CanOperationError(f"state must be ACTIVE or PASSIVE; instead received {new_state}")
+            raise can.CanOperationError(f"state must be ACTIVE or PASSIVE; received {new_state}")
         self._check_open()
         listen_only = _LISTEN_ONLY[new_state]
         self._set("set", {"listen_only": listen_only})

@@ -272,19 +272,19 @@ class Codec:
             return ProtocolError(reason, text, sequence=sequence)
 
         if version != VERSION:
-            raise error(Reason.VERSION, f"version must be {VERSION}; instead received {version}")
+            raise error(Reason.VERSION, f"version must be {VERSION}; received {version}")
         if number != self.address.number:
-            text = f"instrument must be {self.address.number} ({self.address.name}); instead received {number}"
+            text = f"instrument must be {self.address.number} ({self.address.name}); received {number}"
             raise error(Reason.INSTRUMENT, text)
         if code not in self.kinds:
-            raise error(Reason.KIND, f"kind must be a kind of the {self.address.name}; instead received {code:#04x}")
+            raise error(Reason.KIND, f"kind must be a kind of the {self.address.name}; received {code:#04x}")
         kind, layout = self.kinds[code]
         start = HEAD.size + layout.size
         if len(data) < start or (kind.TAIL is None and len(data) != start):
-            raise error(Reason.LENGTH, f"{kind.__name__} must be {start} bytes long; instead received {len(data)}")
+            raise error(Reason.LENGTH, f"{kind.__name__} must be {start} bytes long; received {len(data)}")
         values: list[Any] = list(layout.unpack_from(data, HEAD.size))
         if any(isinstance(value, float) and not math.isfinite(value) for value in values):
-            raise error(Reason.VALUE, f"{kind.__name__} must contain finite numbers; instead received {values}")
+            raise error(Reason.VALUE, f"{kind.__name__} must contain finite numbers; received {values}")
         if kind.TAIL == Tail.TEXT:
             try:
                 values.append(data[start:].decode())

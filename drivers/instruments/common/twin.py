@@ -124,7 +124,7 @@ class Twin:
             return self._start()
         if isinstance(request, protocol.Stop):
             return self._stop(request)
-        raise ProtocolError(Reason.KIND, f"kind must be a request; instead received {type(request).__name__}")
+        raise ProtocolError(Reason.KIND, f"kind must be a request; received {type(request).__name__}")
 
     def _datasheet(self) -> Datasheet:
         name = self.CODEC.address.name

@@ -128,7 +128,7 @@ class Table:
         from rich.text import Text
 
         if len(cells) not in (1, len(self.headings)):
-            raise ValueError(f"a row must be 1 or {len(self.headings)} cells; instead received {len(cells)}")
+            raise ValueError(f"a row must be 1 or {len(self.headings)} cells; received {len(cells)}")
         texts = [Text(cell) if isinstance(cell, str) else cell for cell in cells]
         self.rows.append(([Text(printable(text.plain), text.style) for text in texts], style))
 
