@@ -77,7 +77,7 @@ def claim_groups(*, ensemble: int) -> Groups:
 
 
 def scale_supports(scale: float) -> dict[str, Any]:
-    """Return scaled stiffness and damping of all supports of the houses."""
+    """Return scaled stiffness and damping of all supports of the housings."""
     corrected = load_parameters("corrected").entries
     return {key: float(corrected[key].value) * scale for key in HOUSE_KEYS}
 

@@ -33,7 +33,7 @@ Numbers = dict[str, Any]
 
 
 def question_groups(*, ensemble: int) -> Groups:
-    """Return hammer pulses for the questions on the houses."""
+    """Return hammer pulses for the questions on the housings."""
     groups: Groups = {}
     for mass in OUTER_MASSES_KG:
         pulse = Pulse(label=f"M_oh {mass:g} kg", changes={"house.outer_mass": mass})
@@ -114,7 +114,7 @@ def _drop_run(one: Reproduction) -> Numbers:
 
 
 def _amplification(run: Run) -> Numbers:
-    """Return the largest reaction relative to its own contact force and to that of a rigid house."""
+    """Return the largest reaction relative to its own contact force and to that of a rigid housing."""
     reaction = float((run["P_S"] - run["P_N"]).max())
     rigid = bare_drop({"model.stator": "rigid"})
     return {

@@ -103,7 +103,7 @@ def drop_spread(parameters: str, samples: int) -> dict[str, np.ndarray]:
     """Return numbers of the drop with all assumed values varied together, by statement, each of shape (n,).
 
     Ambiguous statements contribute both readings: the path in the ring or at the probes, the acceleration in m/s² or in
-    g, the reaction relative to its own contact force or to that of a rigid house.
+    g, the reaction relative to its own contact force or to that of a rigid housing.
     """
     found: dict[str, list[float]] = {}
     own = load_parameters(parameters).entries

@@ -107,7 +107,7 @@ def first_impacts(penetration: np.ndarray, times_ms: np.ndarray) -> tuple[float,
 
 @house_style()
 def draw_drop(found: dict[str, Reproduction]) -> Figure:
-    """Draw figures 10 and 11: trajectory, y(t), SOUTH reaction, inner house."""
+    """Draw figures 10 and 11: trajectory, y(t), SOUTH reaction, inner housing."""
     figure, columns = _columns(
         found, "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", 11.4, heights=(1.25, 1, 1, 1)
     )
