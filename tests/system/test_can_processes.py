@@ -199,7 +199,7 @@ def test_nodes_are_informed_of_a_killed_hub(own_hub: Bench) -> None:
     bus = own_hub.bus()
     own_hub.child.kill()
     until(lambda: bus.state is can.BusState.ERROR)
-    with pytest.raises(can.CanOperationError, match="has gone"):
+    with pytest.raises(can.CanOperationError, match="is lost: nothing can be sent"):
         bus.send(can.Message(arbitration_id=1))
 
 

@@ -369,7 +369,7 @@ def test_after_a_full_disk_recover_completes_the_recording(tmp_path):
         assert "ended: disk error" in output
         assert "lost: all data after " in output
         assert "lost: nothing" not in output
-        assert "is kept in" in " ".join(errors.split())
+        assert "are kept in" in " ".join(errors.split())
         part = path.with_name("run.mcap.part")
         recover([part])
         recording = Recording.open(tmp_path / "run.recovered.mcap")

@@ -135,7 +135,7 @@ def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
             # The capacity of a real bus of this speed does not limit the virtual one.
             CanOutput(f"virtual:{channel}", both) as output,
         ):
-            player = Player(Track([path]), output.beside(server), FreeRun())
+            player = Player(Track([path]), output.join_server(server), FreeRun())
             player.prepare()
             output.start(paced=False)
             player.run()

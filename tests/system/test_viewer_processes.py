@@ -89,7 +89,7 @@ def test_a_recording_becomes_an_rrd(recorded: Path, tmp_path: Path) -> None:
     [
         ([], "either a FILE or --live"),
         (["missing.mcap"], "file must be"),
-        ([__file__], "which is no MCAP file"),
+        ([__file__], "which is not an MCAP file"),
         ([str(ROOT)], "file must be"),
         (["a.mcap", "--live"], "either a FILE or --live"),
         (["a.mcap", "--save", "a.mcap"], "ends in .rrd"),

@@ -119,7 +119,7 @@ WRONG = {
     "misspelt place": (
         HEAD + '[limits]\ndanger = "2 mm"\n' + PEAK.replace("2 mm", "{dangr}"),
         7,
-        "expect.must must be a text with names of [limits] or [matrix.device] between braces, such as danger; instead",
+        "expect.must must be a text with names of [limits] or [matrix.device] between braces, such as danger; received",
     ),
     "limit that is a number": (
         HEAD + "[limits]\ndanger = 2\n" + PEAK,

@@ -333,7 +333,7 @@ def test_a_truncated_recording_cannot_be_a_bench(tmp_path: Path) -> None:
     data, half = (ROOT / "replays/sessions/hammer-6.2.mcap").read_bytes(), tmp_path / "half.mcap"
     half.write_bytes(data[: len(data) // 2])
     validate_replay(ROOT / "replays/sessions/hammer-6.2.mcap")
-    with pytest.raises(InputError, match=r"^--replay must be a complete recording; instead.*half.mcap, which"):
+    with pytest.raises(InputError, match=r"^--replay must be a complete recording; received.*half.mcap, which"):
         validate_replay(half)
 
 

@@ -225,7 +225,7 @@ def test_each_kind_of_invalid_command_has_its_result() -> None:
         (
             CommandKind.SPEED,
             {"speed_hz": 5.0, "force_n": 10.0},
-            "force_n must be left out: SPEED has no such value; instead",
+            "force_n must be left out: SPEED has no such value; received",
         ),
         (
             CommandKind.HAMMER,

@@ -139,7 +139,7 @@ def test_exposure_reports_the_admitted_roles(tmp_path: Path) -> None:
     assert exposed.holder == read_holder(tmp_path / "keys" / "server", server=True)
     assert Serving(expose="lab.example:9000", plaintext=True).exposure() == ("lab.example:9000", None)
     with pytest.raises(
-        InputError, match=r"--expose must be given with --tls DIR \(made by: rig keys init DIR --host lab"
+        InputError, match=r"--expose must be given with --tls DIR \(create it: rig keys init DIR --host lab"
     ):
         Serving(expose="lab.example:9000").exposure()
     with pytest.raises(InputError, match="received both"):
@@ -153,7 +153,7 @@ def test_exposure_without_tls_reports_what_is_open(capsys: pytest.CaptureFixture
     server = SimpleNamespace(endpoint="127.0.0.1:7460")
     print_addresses(server, Serving(expose="192.0.2.1", plaintext=True).exposure())  # type: ignore[arg-type]
     errors = capsys.readouterr().err
-    assert "WARNING: 192.0.2.1:7463 is open to everybody, unencrypted" in errors
+    assert "WARNING: 192.0.2.1:7463 is open to every client, unencrypted" in errors
     assert "commands, notes, truth" in errors
     print_addresses(server, None)  # type: ignore[arg-type]
     assert capsys.readouterr().err == "rig: listening on 127.0.0.1:7460; Ctrl-C or `rig stop` ends it\n"

@@ -123,10 +123,10 @@ def change_line(number: int, change: Callable[[str], str]) -> Callable[[str], st
         ({}, lambda _: "\0\x89PNG", "solver must be in one line"),
         ({"phase": "rub"}, str, "phase must be one of first-impacts, transient, whirl, drop"),
         ({"solver": "tsit5"}, str, "solver must be 1 to 40 ASCII characters"),
-        ({"solver": "heyoka"}, str, "solver must be of"),
-        ({"solver": "reference"}, str, "solver must be of"),
-        ({"solver": r"$\frac$"}, str, "solver must be of"),
-        ({"setting": ""}, str, "setting must be of"),
+        ({"solver": "heyoka"}, str, "solver must be 1 to 40"),
+        ({"solver": "reference"}, str, "solver must be 1 to 40"),
+        ({"solver": r"$\frac$"}, str, "solver must be 1 to 40"),
+        ({"setting": ""}, str, "setting must be 1 to 40"),
         ({"cpu_s": "0"}, str, "cpu_s must be a number from 1e-09"),
         ({"cpu_s": "nan"}, str, "cpu_s must be a number"),
         ({"cpu_s": "1 s"}, str, "cpu_s must be a number"),
@@ -161,9 +161,9 @@ def test_wrong_options_are_refused_in_one_line(capsys: pytest.CaptureFixture[str
     path, folder = tmp_path / "mine.csv", tmp_path / "out"
     path.write_text(at_rest(), encoding="utf-8")
     assert "file must be a file that can be read" in run_refused(capsys, "--add", f"{path}x", "-o", str(folder))
-    assert "the only option besides" in run_refused(capsys, "--add", str(path), "--full", "-o", str(folder))
-    assert "the only option besides" in run_refused(capsys, "--problem", "drop", "--draw", "-o", str(folder))
-    assert "the only option besides" in run_refused(capsys, "--problem", "drop", "--add", str(path), "-o", str(folder))
+    assert "the only option except" in run_refused(capsys, "--add", str(path), "--full", "-o", str(folder))
+    assert "the only option except" in run_refused(capsys, "--problem", "drop", "--draw", "-o", str(folder))
+    assert "the only option except" in run_refused(capsys, "--problem", "drop", "--add", str(path), "-o", str(folder))
     assert "phase must be one of" in run_refused(capsys, "--problem", "rub", "-o", str(folder))
     assert not folder.exists()
     assert "must be a folder" in run_refused(capsys, "--problem", "drop", "-o", str(path))

@@ -190,7 +190,7 @@ def test_a_level_that_saves_less_than_a_tenth_is_kept(monkeypatch: pytest.Monkey
         return 1.0 - cost(simpler) / cost(fuller)
 
     monkeypatch.setattr("replays.studies.ladder.search.measure", measured)
-    monkeypatch.setattr("replays.studies.ladder.search.saving", saved)
+    monkeypatch.setattr("replays.studies.ladder.search.compute_saving", saved)
     found = search(load_scene("hammer"), {"spin": 0.1})
     assert found.picked.candidate.model == {
         "magnet": "map",  # the linear one saves 3 %

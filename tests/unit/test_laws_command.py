@@ -33,7 +33,7 @@ def test_table_names_every_law_and_marks_those_in_use(capsys: pytest.CaptureFixt
     assert marked == ["lankarani-nikravesh", "internal-sphere"]
     # A unit in brackets is not markup.
     assert "contact [ms]" in lines[1]
-    assert "returns 0.913 where 0.9 is asked" in lines[-1]
+    assert "returns 0.913 for 0.9 requested" in lines[-1]
 
 
 def test_document_contains_both_families(capsys: pytest.CaptureFixture[str]) -> None:

@@ -129,7 +129,7 @@ def test_a_device_that_reports_a_future_block_is_removed(end_tick: int) -> None:
         ):
             device.done(end_tick)
         (reply,) = steps.join()
-        reason = f"it was done with tick {end_tick}; the block that it was given ends at tick {BLOCK}"
+        reason = f"it reported the end of tick {end_tick}; the current block ends at tick {BLOCK}"
         assert reply.lost == {"a": reason}
         assert rig.console.step(BLOCK).lost == {}
 
@@ -185,7 +185,7 @@ def test_a_stop_does_not_wait_for_devices() -> None:
 @pytest.mark.parametrize(
     ("command", "fields", "says"),
     [
-        ("join", {"device": "a"}, "join.device must be a name under which no other device has joined; instead"),
+        ("join", {"device": "a"}, "join.device must be a name under which no other device has joined; received"),
         ("join", {"device": "b", "patience_s": 0}, "join.patience_s must be greater than 0"),
         ("join", {"device": "b\n"}, "join.device must be a line of 1 to 100 printable characters"),
         ("join", {"device": "  "}, "join.device must be a line of 1 to 100 printable characters, not all blank"),
@@ -211,7 +211,7 @@ def test_malformed_or_unknown_reports_are_refused_without_effect(
 def test_devices_are_waited_for_only_in_lockstep() -> None:
     with (
         Running(FakeSimulation(duration_s=None), FreeRun()) as rig,
-        pytest.raises(RefusedError, match="join must be sent to a rig that runs with --pace lockstep; instead"),
+        pytest.raises(RefusedError, match="join must be sent to a rig that runs with --pace lockstep; received"),
     ):
         rig.console.join()
 

@@ -64,7 +64,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
         InputError, match=r"HOST:PORT such as 127.0.0.1:7460, or the name of a running rig \(none runs\)"
     ):
         Console.open("bench", wait_s=0.0)
-    with names.register_name("bench-2", "127.0.0.1:7777"), pytest.raises(InputError, match="such as bench-2; instead"):
+    with names.register_name("bench-2", "127.0.0.1:7777"), pytest.raises(InputError, match="such as bench-2; received"):
         Daq.open("bench", wait_s=0.0)
     with pytest.raises(InputError, match="url must be zenoh:HOST:PORT"):
         Console.open("http://x")

@@ -511,7 +511,7 @@ def test_a_file_in_pieces_is_the_whole_file(suffix: str, tmp_path: Path, monkeyp
     else:
         write_parquet(path, columns)
     monkeypatch.setattr(columnar, "_PIECE", 700)
-    monkeypatch.setattr(delimited, "_BLOCK", 1 << 12)
+    monkeypatch.setattr(delimited, "_BLOCK_BYTES", 1 << 12)
     monkeypatch.setattr(delimited, "_KEPT", 0)
     monkeypatch.setattr(mdf, "_PIECE", 1 << 12)
     source = open_source(path, FileOptions())

@@ -191,9 +191,9 @@ def test_invalid_sensitivities_are_refused(text: str) -> None:
 
 def test_a_sensitivity_of_another_quantity_is_refused_with_valid_units() -> None:
     for text in ("1 V/N", "1 V/bananas", "1 V/M"):
-        with pytest.raises(InputError, match=r"x must be volts per unit of length \(m, cm, .*thou.*\); instead"):
+        with pytest.raises(InputError, match=r"x must be volts per unit of length \(m, cm, .*thou.*\); received"):
             units.sensitivity_v(text, "mm", field="x")
-    with pytest.raises(InputError, match="x must be volts per bananas; instead"):
+    with pytest.raises(InputError, match="x must be volts per bananas; received"):
         units.sensitivity_v("1 V/mm", "bananas", field="x")
     with pytest.raises(InputError, match="x must be K, as degF counts from another zero"):
         units.sensitivity_v("10 mV/degF", "K", field="x")
@@ -213,7 +213,7 @@ def test_an_unconvertible_unit_is_refused_with_valid_ones() -> None:
         units.factor("mm", "bananas", field="x")
     with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\); received 'N'"):
         units.factor("N", "mm", field="x")
-    with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\), with a sensitivity; instead"):
+    with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\), with a sensitivity; received"):
         units.factor("mV", "mm", field="x")
     with pytest.raises(InputError, match=r"one of m, cm, .*, or V or mV with a sensitivity \(such as thou\)"):
         units.factor("thou2", "mm", field="x")

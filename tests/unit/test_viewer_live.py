@@ -194,7 +194,7 @@ def test_a_slow_viewer_gets_fewer_pictures_with_all_peaks(recording: Synthetic, 
     saved = Saved(tmp_path / "paced.rrd")
     pictures = len(saved["/orbit/ring/trace", "LineStrips2D:strips"].values)
     assert pictures > 5 if prompt else pictures <= 2
-    assert said[-1].startswith("viewer 0." if prompt else "viewer loading")
+    assert said[-1].startswith("viewer late by 0." if prompt else "viewer loading")
     ring = saved["/sensors/probes/ring", "Scalars:scalars"]
     assert view.received == 5 * len(recording.times_s)
     assert max(row[0] for row in ring.values) == pytest.approx(RADIUS_MM, abs=3e-3)
