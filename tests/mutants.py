@@ -70,8 +70,8 @@ _INVERSE_OPERATORS = {
 _DISPLAY_FUNCTIONS = ("__repr__", "__str__", "picture", "verdict_line", "describe")
 """Functions whose places are skipped: their results are only displayed."""
 PICKED_MUTANTS = (
-    ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=not self.doubts"),
-    ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=PASS in verdicts"),
+    ("replays/score/card/scorecard.py", "=PASS in verdicts and not self.doubts", "=not self.doubts"),
+    ("replays/score/card/scorecard.py", "=PASS in verdicts and not self.doubts", "=PASS in verdicts"),
     ("replays/score/card/scorecard.py", "limit.low <= low and high <= limit.high", "limit.low <= value <= limit.high"),
     ("replays/score/card/scorecard.py", "high < limit.low or low > limit.high", "low < limit.low or high > limit.high"),
     ("replays/estimate/intervals.py", "student_quantile(0.975, freedom)", "student_quantile(0.95, freedom)"),

@@ -107,7 +107,7 @@ def test_streams_tell_their_extent(recording):
         ),
         (
             lambda recording: recording.samples("probes")["disk"],
-            "name must be one of those .* such as disk_y",
+            "name must be one of the existing names.* such as disk_y",
         ),
         (lambda recording: list(recording.blocks(STATUS)), "key must be a key of blocks"),
     ],
