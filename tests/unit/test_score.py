@@ -512,7 +512,7 @@ def test_a_file_in_pieces_is_the_whole_file(suffix: str, tmp_path: Path, monkeyp
         write_parquet(path, columns)
     monkeypatch.setattr(columnar, "_PIECE", 700)
     monkeypatch.setattr(delimited, "_BLOCK_BYTES", 1 << 12)
-    monkeypatch.setattr(delimited, "_KEPT", 0)
+    monkeypatch.setattr(delimited, "_MAX_CACHED_VALUES", 0)
     monkeypatch.setattr(mdf, "_PIECE", 1 << 12)
     source = open_source(path, FileOptions())
     assert source.pieces is not None
