@@ -154,10 +154,10 @@ def test_random_faults_have_their_rate_and_are_independent(part: float) -> None:
 
 
 @pytest.mark.parametrize(("request_", "says"), [
-    ({"channel": "disk_x", "kind": "dropout"}, "a group for dropout, as a block is of all its"),
+    ({"channel": "disk_x", "kind": "dropout"}, "a group for dropout, as a block has all its"),
     ({"channel": "prbes", "kind": "dropout"}, "one of the groups for dropout, such as probes"),
     ({"channel": "probes", "kind": "dropout", "door": "tcp"}, "door must be"),
-    ({"channel": "forces", "kind": "stale-stamps", "door": "can"}, "probes, whose time Sync tells"),
+    ({"channel": "forces", "kind": "stale-stamps", "door": "can"}, "probes, whose time is in Sync"),
     ({"channel": "probes", "kind": "restart"}, "one that shows from the first row on, such as dropout"),
     ({"channel": "probes", "kind": "late-blocks", "delay_s": 11.0}, "delay_s must be"),
 ])  # fmt: skip

@@ -180,7 +180,7 @@ CASES = [
     parameters("missing base", "[contact]\nfriction = 0.1", "base", "one of corrected, as-printed, dtu-2019"),
     parameters("unknown base", 'base = "nosuch"', "base", "one of corrected, as-printed, dtu-2019"),
     parameters("base is a number", "base = 4", "base", "must be"),
-    parameters("base is itself", 'base = "base-is-itself.toml"', "base", "another set"),
+    parameters("base is itself", 'base = "base-is-itself.toml"', "base", "a set other than the file itself"),
     parameters(
         "unknown key", 'base = "corrected"\n[contact]\nfrict = 0.1', "contact.frict", "such as contact.friction"
     ),

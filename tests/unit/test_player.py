@@ -201,7 +201,7 @@ def test_a_player_that_cannot_keep_up_reports_its_lag(track: Track) -> None:
         late_s = (time.ns - begin_ns - DURATION_NS) / 1e9
         assert (summary["replay"]["behind_s"] > 0.5) == behind
         assert abs(summary["replay"]["behind_s"] - (late_s if behind else 0.0)) < 0.1
-        assert any("behind" in text for text in player.status()["warnings"]) == behind
+        assert any("late by" in text for text in player.status()["warnings"]) == behind
 
 
 def test_documents_come_from_the_file_and_the_status_names_the_replay(track: Track) -> None:

@@ -110,7 +110,7 @@ def test_a_complete_file_is_not_recovered(path, tmp_path, capsys):
     source = tmp_path / "run.mcap"
     source.write_bytes(path.read_bytes())
     assert run("recover", source) == 0
-    assert "run.mcap is whole" in capsys.readouterr().out
+    assert "run.mcap is complete" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == [source]
     assert run("recover", source, "--force") == 1
     assert (tmp_path / "run.recovered.mcap").exists()

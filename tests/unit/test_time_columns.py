@@ -57,7 +57,7 @@ def test_the_unit_of_a_time_since_1970_follows_from_its_size(tmp_path: Path, uni
 @pytest.mark.parametrize("unit", ["M", "bananas", "mm", "weeks"])
 def test_a_time_column_with_an_unknown_unit_must_be_specified(tmp_path: Path, unit: str) -> None:
     path = log(tmp_path, f"time [{unit}]", [str(n) for n in range(20)])
-    with pytest.raises(InputError, match=rf"file.time_unit must be given .*received '{unit}'"):
+    with pytest.raises(InputError, match=rf"file.time_unit must be set .*received '{unit}'"):
         open_source(path, FileOptions())
     times_s = stamps(open_source(path, FileOptions(time_unit="min")))
     np.testing.assert_allclose(times_s, 60.0 * np.arange(20))

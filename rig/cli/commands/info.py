@@ -30,7 +30,7 @@ def info(
     quick: Annotated[bool, typer.Option("--quick", help="Skip the samples, and the verdict")] = False,
     form: Form,
 ) -> None:
-    """Show calibration, gaps, health, events, notes and end of a recording; several files count as one.
+    """Show the calibration, gaps, health and events of a recording; several files count as one.
 
     Exit status: 0 pass; 1 fail (incomplete, rows lost, or contradictory); 2 wrong input; 3 inconclusive (the rig
     reported warnings, or bytes could not be checked). Doubts about channels do not change the verdict. With --quick
