@@ -78,7 +78,7 @@ def _views_titled(text: str, columns: list[_Column]) -> list[rrb.View | rrb.Cont
     rows = [row for views, _ in columns for row, _ in views]
     views = [view for row in rows for view in (row.contents if isinstance(row, rrb.Container) else [row])]
     titles = [str(view.name) for view in views]
-    found = [view for view, title in zip(views, titles, strict=True) if text.lower() in title.lower()]
+    found = [view for view, title in zip(views, titles, strict=True) if text.strip() and text.lower() in title.lower()]
     if not found:
         raise InputError("--only", f"part of a title: {'; '.join(titles)}", text)
     return found

@@ -18,6 +18,7 @@ from recorder.viewer.drawings.geometry import Geometry
 from recorder.viewer.painter import list_missing_views
 from replays.recordings.export import write_run
 from rig.base import wire
+from rig.base.errors import InputError
 from rig.channels.table import ChannelTable, default_table
 from rig.cli.main import main
 from rig.run.scenes import parse_scene
@@ -290,6 +291,14 @@ def _views(container: Any) -> list[Any]:
     if not hasattr(container, "contents") or hasattr(container, "origin"):
         return [container]
     return [view for inner in container.contents for view in _views(inner)]
+
+
+def test_only_views_with_a_text_in_their_title_are_shown() -> None:
+    plan = blueprint.layout(default_table(), Geometry(), live=False, only="ORBIT")
+    assert [str(view.origin) for view in _views(plan.root_container)] == ["/orbit/ring", "/orbit/disk"]
+    for text in ("", " ", "orbits"):
+        with pytest.raises(InputError, match=r"^--only must be part of a title: Orbit at the ring"):
+            blueprint.layout(default_table(), Geometry(), live=True, only=text)
 
 
 def test_the_command_accepts_parts_and_shows_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
