@@ -2,12 +2,13 @@
 
 Prints one line for each action, with its simulated time. Each is also written to the stream as a note with the tag
 `protection` and its kind, such as `danger` or `trip`, as a contact that other programs can read. A note of another
-program with the tag `reset` resets the monitor.
+program is a contact of the monitor: see `take_input`.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, get_args, get_origin
@@ -28,9 +29,24 @@ def protect(machine: Any, protection: Protection, show: Callable[[str], object] 
         show: Called with each line.
     """
     for samples in machine.blocks():
-        if any("reset" in event.get("tags", ()) and "protection" not in event["tags"] for event in _events(machine)):
-            protection.reset()
+        for event in _events(machine):
+            if "protection" not in (tags := event.get("tags", ())):
+                take_input(protection, tags, event.get("text", ""))
         act(machine, protection.settings, protection.feed(samples), show)
+
+
+def take_input(protection: Protection, tags: Iterable[str], text: str) -> None:
+    """Apply contacts: `reset`; `bypass` and `bypass-off` with a channel as text; `multiply` with 1 to 3 as text."""
+    for tag in tags:
+        if tag == "reset":
+            protection.reset()
+        elif tag == "bypass":
+            protection.bypassed |= {text} & set(protection.settings.channels)
+        elif tag == "bypass-off":
+            protection.bypassed -= {text}
+        elif tag == "multiply":
+            with contextlib.suppress(ValueError):  # not a number: no change
+                protection.multiply = factor if 1.0 <= (factor := float(text)) <= 3.0 else protection.multiply
 
 
 def act(machine: Any, settings: Settings, actions: Iterable[Action], show: Callable[[str], object] = print) -> None:

@@ -31,6 +31,8 @@ Alarm = tuple[str, str]
 TRIP: Alarm = ("trip", "")
 _PULSE = (0.6, 0.4)
 """Keyphasor levels, 0 to 1: a pulse begins above the first, after the signal was below the second."""
+_MIN_ORBIT = 0.1
+"""Diameter of the smallest orbit whose direction counts, a multiple of the alert set point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +40,13 @@ class Action:
     """An alarm, the end of one, or another action at one row.
 
     Attributes:
-        kind: alert, danger, overspeed, speed-lost, not-ok or trip at its beginning; clear when an alarm ends without a
-            reset; reset; rows-lost.
+        kind: alert, danger, overspeed, speed-lost, reverse, not-ok or trip at its beginning; clear when an alarm ends
+            without a reset; reset; rows-lost.
         name: Channel; for a trip the first alarm, for clear and reset the alarm.
         row: Number of the row since the start of the stream.
         tick: Simulated time, rounded [ticks].
         time_s: Simulated time, exact [s].
-        value: Level [um], speed [Hz], output of a probe [V], or number of rows.
+        value: Level [um], speed [Hz], output of a probe [V], or number of turns or rows.
     """
 
     kind: str
@@ -75,7 +77,7 @@ class Protection:
         self.first_out: list[Alarm] = []
         self._latching = {"trip"}
         self._latching |= {"danger", "overspeed"} if settings.latch_danger else set()
-        self._latching |= {"alert", "speed-lost"} if settings.latch_alert else set()
+        self._latching |= {"alert", "speed-lost", "reverse"} if settings.latch_alert else set()
         self._received = Continuity()
         self._next: int | None = None
         self._to_reset = False
@@ -157,7 +159,8 @@ class Protection:
         self._means: list[float] = []
         self._tail = np.full((2, self._window - 1), math.nan)
         self._over: dict[Alarm, bool] = {("pulse", ""): True}
-        self._pulse, self._turning, self._speed_hz, self._fast = first, False, 0.0, 0
+        self._pulse, self._turning, self._speed_hz, self._fast, self._reverse = first, False, 0.0, 0, 0
+        self._last_motion, self._area, self._turn_area = np.zeros((2, 1)), 0.0, 0.0
 
     def _rows(self, duration_s: float) -> int:
         return math.ceil(duration_s * self._rate_hz - 1e-6)
@@ -178,7 +181,8 @@ class Protection:
         """Return for each alarm whether it is on at each row, and its value there; in order of rank for one row."""
         settings, index = self.settings, np.arange(first, first + signals.shape[1])
         probes, armed = (settings.x, settings.y), index >= self._armed
-        levels, volts = self._levels(signals[:2]), settings.bias_v + 1e-3 * settings.scale_v_per_mm * signals[:2]
+        motion = self._remove_gap(signals[:2])
+        levels, volts = self._levels(motion), settings.bias_v + 1e-3 * settings.scale_v_per_mm * signals[:2]
         inside = (volts >= settings.ok_low_v) & (volts <= settings.ok_high_v)
         recovery = self._rows(settings.ok_recovery_s)
         good = np.array([self._run(("ok", name), each) > recovery for name, each in zip(probes, inside, strict=True)])
@@ -195,7 +199,7 @@ class Protection:
                 above = self._apply_hysteresis((kind, name), enabled, high, high * (1.0 - settings.hysteresis))
                 causes[kind, name] = self._run((kind, name), above) > self._rows(delay_s), level
         if settings.uses_keyphasor:
-            causes |= self._speed(signals[2], index, armed & (settings.keyphasor not in self.bypassed))
+            causes |= self._speed(signals[2], motion, index, armed & (settings.keyphasor not in self.bypassed))
         self._causes = {alarm: bool(on[-1]) for alarm, (on, _) in causes.items()}
         states = {
             alarm: (np.logical_or.accumulate(on) | (alarm in self.active) if alarm[0] in self._latching else on, value)
@@ -207,36 +211,52 @@ class Protection:
         states[TRIP] = np.logical_or.accumulate(trip) | self.tripped, levels.max(axis=0)
         return states
 
-    def _levels(self, probes: np.ndarray) -> np.ndarray:
-        """Return the measure of each probe over the window that ends at each row [um], shape (2, rows)."""
+    def _remove_gap(self, probes: np.ndarray) -> np.ndarray:
+        """Return the probes without their DC gap [um], shape (2, rows)."""
         part = self._part
         means = [
             list(accumulate(probe.tolist(), lambda mean, value: mean + part * (value - mean), initial=mean))
             for probe, mean in zip(probes, self._means or probes[:, 0].tolist(), strict=True)
         ]
         self._means = [each[-1] for each in means]
-        rows = np.hstack([self._tail, probes - np.array(means)[:, 1:]])
+        return probes - np.array(means)[:, 1:]
+
+    def _levels(self, motion: np.ndarray) -> np.ndarray:
+        """Return the measure of each probe over the window that ends at each row [um], shape (2, rows)."""
+        rows = np.hstack([self._tail, motion])
         self._tail = rows[:, rows.shape[1] - self._window + 1 :]
         if self.settings.measure == "smax":
             return np.tile(_sliding_extreme(np.fmax, np.hypot(*rows), self._window), (2, 1))
         return _sliding_extreme(np.fmax, rows, self._window) - _sliding_extreme(np.fmin, rows, self._window)
 
-    def _speed(self, keyphasor: np.ndarray, index: np.ndarray, enabled: np.ndarray) -> dict[Alarm, tuple]:
+    def _speed(
+        self, keyphasor: np.ndarray, motion: np.ndarray, index: np.ndarray, enabled: np.ndarray
+    ) -> dict[Alarm, tuple[np.ndarray, np.ndarray]]:
         settings, before = self.settings, self._over["pulse", ""]
+        x, y = np.hstack([self._last_motion, motion])
+        area, self._last_motion = self._area + 0.5 * np.cumsum(x[:-1] * y[1:] - x[1:] * y[:-1]), motion[:, -1:]
         high = self._apply_hysteresis(("pulse", ""), keyphasor, *_PULSE)
         begins = [row for row in _changes(high, before) if high[row]]
-        speed_hz, fast, pulse = (np.full(len(index), state) for state in (self._speed_hz, self._fast, self._pulse))
+        states = (self._speed_hz, self._fast, self._pulse, self._reverse)
+        speed_hz, fast, pulse, reverse = (np.full(len(index), state) for state in states)
         for row in begins:
             self._speed_hz = self._rate_hz / (index[row] - self._pulse) if self._turning else 0.0
             self._fast = self._fast + 1 if self._speed_hz > settings.overspeed_hz else 0
+            # The orbit of a turn encloses a negative area if it runs against the rotation.
+            against = self._turning and area[row] - self._turn_area < -_circle_area(_MIN_ORBIT * settings.alert_um)
+            self._reverse, self._turn_area = self._reverse + 1 if against else 0, float(area[row])
             self._pulse, self._turning = int(index[row]), True
             speed_hz[row:], fast[row:], pulse[row:] = self._speed_hz, self._fast, self._pulse
+            reverse[row:] = self._reverse
+        self._area = float(area[-1])
         # The current turn already lasts longer than one at the limit: a shaft at rest has no pulses.
         over = (fast >= settings.overspeed_turns) & ((index - pulse) * settings.overspeed_hz < self._rate_hz)
         lost = index - np.maximum(pulse, self._armed) >= self._rows(settings.speed_lost_s)
+        backward = (reverse >= settings.reverse_turns) & enabled & (settings.reverse_turns > 0)
         return {
             ("overspeed", settings.keyphasor): (over & enabled & (settings.overspeed_hz > 0.0), speed_hz),
             ("speed-lost", settings.keyphasor): (lost & enabled & (settings.speed_lost_s > 0.0), speed_hz),
+            ("reverse", settings.keyphasor): (backward, reverse),
         }
 
     def _vote(self, dangers: list[np.ndarray], bad: np.ndarray) -> np.ndarray:
@@ -265,6 +285,10 @@ class Protection:
         above = np.where(last >= 0, values[last] > high, self._over.get(alarm, False))
         self._over[alarm] = bool(above[-1])
         return above
+
+
+def _circle_area(diameter: float) -> float:
+    return 0.25 * math.pi * diameter**2
 
 
 def _changes(on: np.ndarray, before: bool) -> np.ndarray:

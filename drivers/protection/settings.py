@@ -64,6 +64,8 @@ class Settings(Written):
     """Consecutive turns above the limit that trip; one spurious pulse makes two."""
     speed_lost_s: Seconds = 0.0
     """Time without a pulse that raises an alarm, not a trip [s]; 0 switches it off."""
+    reverse_turns: Annotated[int, Field(ge=0, le=100)] = 0
+    """Consecutive turns with an orbit against the rotation that raise an alarm, not a trip; 0 switches it off."""
     trip: Literal["speed 0", "stop"] = "speed 0"
     """Action on the rig at a trip."""
 
@@ -85,7 +87,7 @@ class Settings(Written):
     @property
     def uses_keyphasor(self) -> bool:
         """Whether the monitor reads the keyphasor."""
-        return self.overspeed_hz > 0.0 or self.speed_lost_s > 0.0
+        return self.overspeed_hz > 0.0 or self.speed_lost_s > 0.0 or self.reverse_turns > 0
 
     @property
     def channels(self) -> list[str]:

@@ -35,6 +35,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--rig-results", metavar="FOLDER", help="write results.json, junit.xml, index.html and evidence/")
     group.addoption("--rig-against", metavar="FOLDER", help="results of an earlier campaign to compare with")
     group.addoption("--rig-url", metavar="URL", help="run on the rig there instead of on rigs of the tests' own")
+    group.addoption("--rig-device", metavar="COMMAND", help="command line of the device under test in TOML campaigns")
     group.addoption("--rig-replay", metavar="FILE", help="run on a recording that is played")
 
 
@@ -72,7 +73,7 @@ class CampaignFile(pytest.File):
         from rig.base.errors import InputError
 
         try:
-            campaign = load_campaign(self.path)
+            campaign = load_campaign(self.path, self.config.option.rig_device)
         except InputError as error:
             raise self.CollectError(str(error)) from None
         for case in campaign.cases:

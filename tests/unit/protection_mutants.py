@@ -33,7 +33,7 @@ class Mutant:
         assert text.count(self.text) == 1, f"{self.name}: its text stands there {text.count(self.text)} times"
         module = ModuleType(self.source.__name__)
         exec(compile(text.replace(self.text, self.instead), self.name, "exec"), module.__dict__)
-        members = {name: getattr(module, name) for name in ("Protection", "act", "protect") if hasattr(module, name)}
+        members = {name: getattr(module, name) for name in vars(sound()) if hasattr(module, name)}
         return SimpleNamespace(**{**vars(sound()), **members})
 
     def fails(self, scenario: str) -> bool:
@@ -123,6 +123,19 @@ MUTANTS = [
     Mutant(
         "speed lost is not told", "missing_pulses_are_an_alarm", "(lost & enabled", "(lost & ~enabled",
     ),
+    Mutant(
+        "reverse the wrong way", "a_reverse_orbit_is_an_alarm",
+        "row] - self._turn_area < -", "row] - self._turn_area > ",
+    ),
+    Mutant("area of each block", "the_division_into_blocks_has_no_effect", "self._area = float(area[-1])", "pass"),
+    Mutant("one reverse turn", "a_reverse_orbit_is_an_alarm", "reverse >= settings.reverse_turns", "reverse >= 1"),
+    Mutant(
+        "bypass stays", "notes_are_contacts", "protection.bypassed -= {text}", "protection.bypassed -= set()", runner,
+    ),
+    Mutant(
+        "multiply without limit", "notes_are_contacts",
+        "if 1.0 <= (factor := float(text)) <= 3.0 else", "if (factor := float(text)) else", runner,
+    ),
     Mutant("bypass ignored", "a_bypassed_channel_raises_no_alarm", " & (name not in self.bypassed)", ""),
     Mutant("multiply ignored", "a_trip_multiply_raises_the_set_points", "self.multiply * set_um", "set_um"),
     Mutant(
@@ -144,7 +157,8 @@ MUTANTS = [
         'if action.kind != "clear"]\n    machine.speed(0.0) if len(trips) > 1 else None', runner,
     ),
     Mutant(
-        "own notes reset it", "a_note_of_others_resets_alarms", ' and "protection" not in event["tags"]', "", runner,
+        "own notes reset it", "a_note_of_others_resets_alarms",
+        'if "protection" not in (tags := event.get("tags", ())):', 'if tags := event.get("tags", ()):', runner,
     ),
     Mutant(
         "state of each block", "the_division_into_blocks_has_no_effect",

@@ -286,6 +286,29 @@ def missing_pulses_are_an_alarm(device: Any) -> None:
 
 
 @scenario
+def a_reverse_orbit_is_an_alarm(device: Any) -> None:
+    # Turns of 100 ms; the orbit of 60 um reverses at row 500, in a turn. One of 50 um is too small.
+    turn, sense = 2.0 * math.pi * 10.0 * np.arange(1000) / RATE, np.where(np.arange(1000) < 500, 1.0, -1.0)
+    for diameter_mm, expected in ((0.06, [("reverse", "keyphasor", 750)]), (0.05, [])):
+        x, y = 0.5 * diameter_mm * np.cos(turn), 0.5 * diameter_mm * sense * np.sin(turn)
+        given = settings(reverse_turns=2, window_s=0.1, alert_um=550.0)
+        _, actions = run(device, given, x, y, keyphasor=pulses(1000, *range(50, 1000, 100)))
+        assert told(actions) == expected
+
+
+@scenario
+def notes_are_contacts(device: Any) -> None:
+    monitor = device.Protection(settings())
+    for tags, text, bypassed, multiply in (
+        (["bypass"], "disk_x", {"disk_x"}, 1.0), (["bypass"], "P_N", {"disk_x"}, 1.0),
+        (["bypass-off", "multiply"], "disk_x", set(), 1.0), (["multiply"], "2.5", set(), 2.5),
+        (["multiply"], "9", set(), 2.5), (["multiply"], "nan", set(), 2.5), (["multiply"], "1", set(), 1.0),
+    ):  # fmt: skip
+        device.take_input(monitor, tags, text)
+        assert (monitor.bypassed, monitor.multiply) == (bypassed, multiply), (tags, text)
+
+
+@scenario
 def the_first_alarm_is_marked(device: Any) -> None:
     monitor, actions = run(
         device, settings(), make_swing(300, (110, 1200.0)), make_swing(300, (100, 1200.0), (250, 0.0))
@@ -392,6 +415,7 @@ def make_eventful_rows(rows: int = 6000) -> tuple[Settings, Samples]:
     given = settings(
         window_s=0.12, corner_hz=0.5, hysteresis=0.05, danger_delay_s=0.033, alert_delay_s=0.1, startup_s=0.4,
         overspeed_hz=9.0, overspeed_turns=2, speed_lost_s=0.13, latch_danger=False, danger_um=1200.0,
+        reverse_turns=1,
     )  # fmt: skip
     return given, samples(disk_x=x, disk_y=y, keyphasor=key)
 
@@ -400,7 +424,8 @@ def make_eventful_rows(rows: int = 6000) -> tuple[Settings, Samples]:
 def the_division_into_blocks_has_no_effect(device: Any) -> None:
     given, rows = make_eventful_rows()
     whole = device.Protection(given).feed(rows)
-    assert {each.kind for each in whole} == {"alert", "danger", "trip", "clear", "not-ok", "overspeed", "speed-lost"}
+    kinds = {"alert", "danger", "trip", "clear", "not-ok", "overspeed", "speed-lost", "reverse"}
+    assert {each.kind for each in whole} == kinds
     rng = np.random.default_rng(2)
     by_chance = np.sort(rng.integers(0, 6000, 40))
     for cuts in (np.arange(0, 6001, 20), np.arange(0, 6000, 37), by_chance, np.arange(2400, 2900)):
@@ -445,6 +470,6 @@ def too_many_missing_rows_make_all_probes_not_ok(device: Any) -> None:
 
 def sound() -> Any:
     from drivers.protection import Protection
-    from drivers.protection.__main__ import act, protect
+    from drivers.protection.__main__ import act, protect, take_input
 
-    return SimpleNamespace(Protection=Protection, act=act, protect=protect)
+    return SimpleNamespace(Protection=Protection, act=act, protect=protect, take_input=take_input)

@@ -223,8 +223,10 @@ def test_the_command_prints_the_error_and_exits_with_2(tmp_path: Path, capsys: p
 
 
 SHIPPED = {
-    "daq-acceptance": 5, "daq-loss": 2, "fault-endurance": 10, "hammer": 2, "protection-alarms": 4,
-    "protection-trip": 2, "protection-votes": 18, "recorder-acceptance": 3,
+    "daq-acceptance": 5, "daq-loss": 2, "fault-endurance": 10, "hammer": 2, "protection-alarms": 2,
+    "protection-filter": 2, "protection-inputs": 1, "protection-latch": 1, "protection-ok": 2, "protection-retrip": 1,
+    "protection-speed": 2, "protection-stream": 6, "protection-trip": 2, "protection-values": 6,
+    "protection-votes": 24, "protection-waveform": 2, "recorder-acceptance": 3,
 }  # fmt: skip
 """Campaigns of the rig, and the number of their cases."""
 

@@ -61,6 +61,8 @@ class _Device(Written):
     """True if it takes part in lockstep; if not, the rig does not wait for it."""
     commands: bool = True
     """True if it sends commands, which a recording does not accept."""
+    folder: str = ""
+    """Working folder, relative to that of the campaign file."""
 
 
 class _Matrix(Written):
@@ -167,8 +169,12 @@ def campaign_path(name_or_path: str) -> Path:
     return known.get(name_or_path, path)
 
 
-def load_campaign(path: Path) -> Campaign:
+def load_campaign(path: Path, device: str | None = None) -> Campaign:
     """Read and check a campaign file.
+
+    Args:
+        path: The file.
+        device: Command line that replaces that of the file's device.
 
     Raises:
         InputError: For the first error, with the file and line.
@@ -189,6 +195,11 @@ def load_campaign(path: Path) -> Campaign:
         raise InputError(f"{where}: the text", "TOML", Words(problem)) from None
     with _add_location(path, text):
         file = check(_File, document, field="")
+        if device is not None:
+            if file.device is None:
+                raise InputError("--device", "left out, as the campaign has no device", device)
+            own = file.device.model_copy(update={"command": device, "folder": str(Path.cwd())})
+            file = file.model_copy(update={"device": own})
         cases = tuple(_cases(path, file))
         ids: set[str] = set()
         for case in cases:
@@ -366,6 +377,9 @@ def _step(
     given: Mapping[str, Any], field: str, places: Mapping[str, str], duration_s: float, scene: Scene, file: _File
 ) -> Step:  # fmt: skip
     one = _fill_placeholders(dict(given), places, field)
+    for key, text in given.items():
+        if isinstance(text, str) and (match := _PLACEHOLDER.fullmatch(text)) and match[2]:
+            one[key] = float(one[key])  # a number in a unit
     if "note" in one:
         note = check(_Note, one, field=field)
         step = Step(note.at_s, None, note.note, tuple(note.tags))
@@ -455,5 +469,8 @@ def _device(file: _File, places: Mapping[str, str], path: Path) -> _Device:
         words = shlex.split(command)
     except ValueError as error:
         raise InputError("device.command", "a command line", Words(f"{command} ({error})")) from None
-    check_program(words, path.parent, field="device.command")
+    folder = path.parent / file.device.folder
+    if not folder.is_dir():
+        raise InputError("device.folder", "a folder", file.device.folder)
+    check_program(words, folder, field="device.command")
     return _Device(**{**file.device.model_dump(), "command": command})

@@ -55,7 +55,8 @@ def run_case(case: Case, trial: Trial) -> None:
     device: Device | None = None
     if case.device is not None:
         joins = None if case.device.joins else False
-        device = trial.start_device(case.device.command, name=case.device.name, where=case.file.parent, joins=joins)
+        where = case.file.parent / case.device.folder
+        device = trial.start_device(case.device.command, name=case.device.name, where=where, joins=joins)
     trial.origin_s = bench.begin()
     with bench.connect(name="campaign", channels=()) as machine:
         for step in live:

@@ -137,7 +137,7 @@ class Results:
         file = os.path.relpath(whole, self._config.invocation_params.dir)
         if whole.parent == Path(__file__).parents[1]:  # a shipped campaign has a name
             file = whole.name.partition(".")[0]
-        more = [("--url", self._config.getoption("rig_url")), ("--replay", self._config.getoption("rig_replay"))]
+        more = [(f"--{name}", self._config.getoption(f"rig_{name}")) for name in ("url", "replay", "device")]
         options = [word for option, value in more if value for word in (option, value)]
         return shlex.join(["rig", "campaign", f"{file}{colons}{rest}", *options])
 

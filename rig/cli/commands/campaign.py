@@ -31,12 +31,17 @@ def campaign(
     keyword: Annotated[
         str | None, typer.Option("--keyword", "-k", metavar="WORDS", help="Run only cases with these words in the name")
     ] = None,
+    exit_first: Annotated[bool, typer.Option("--exit-first", "-x", help="Stop at the first case that fails")] = False,
     jobs: Annotated[int, typer.Option("--jobs", "-j", metavar="N", min=1, help="Number of parallel cases")] = 1,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for results, reports and evidence")
     ] = None,
     against: Annotated[
         Path | None, typer.Option("--against", metavar="FOLDER", help="Compare with the results of an earlier campaign")
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(metavar="COMMAND", help="Command line of your device, with the file's placeholders ({url}, ...)"),
     ] = None,
     url: Annotated[
         str | None, typer.Option(metavar="URL", help="Use the rig at this URL; skip cases that it cannot run")
@@ -63,10 +68,12 @@ def campaign(
         raise InputError("--jobs", "1 with --url, as the cases share one rig", jobs)
     if output is not None:
         check_folder(output, field="--output")
-    files = _checked(files, against, replay)
+    files = _checked(files, against, replay, device)
     plugin_options = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
+    plugin_options["--rig-device"] = device
     options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
     options += ["-k", keyword] if keyword is not None else []
+    options += ["-x"] if exit_first else []
     options += ["-n", str(jobs)] if jobs > 1 else ["-n", "0"] if importlib.util.find_spec("xdist") else []
     status = _run(files, options, output)
     if status:
@@ -81,7 +88,7 @@ def _list() -> None:
     echo(f"files in {FOLDER}")
 
 
-def _checked(files: list[str], against: Path | None, replay: Path | None) -> list[str]:
+def _checked(files: list[str], against: Path | None, replay: Path | None, device: str | None) -> list[str]:
     """Return the paths of the files; raise an error for wrong files before anything runs."""
     from replays.campaigns.files.campaign import SUFFIX, campaign_path, load_campaign
     from replays.campaigns.reporting.results import load_results
@@ -92,7 +99,7 @@ def _checked(files: list[str], against: Path | None, replay: Path | None) -> lis
         name = str(campaign_path(name))
         paths.append(f"{name}{colons}{case}")
         if name.endswith(SUFFIX):
-            known = [each.id for each in load_campaign(Path(name)).cases]
+            known = [each.id for each in load_campaign(Path(name), device).cases]
             if colons and case not in known:
                 raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
         elif not Path(name).exists():
