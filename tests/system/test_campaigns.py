@@ -101,9 +101,18 @@ def test_behind(bench, measure):
 """
 
 
+FOREIGN_SETTINGS = """
+[tool.pytest.ini_options]
+addopts = "--strict-config"
+timeout_of_a_plugin_that_is_not_installed = 900
+"""
+"""Settings of a project around a campaign, which must not have an effect."""
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name, text in (("device.py", DEVICE), ("x.campaign.toml", CAMPAIGN), ("test_x.py", TESTS)):
+    files = {"device.py": DEVICE, "x.campaign.toml": CAMPAIGN, "test_x.py": TESTS, "pyproject.toml": FOREIGN_SETTINGS}
+    for name, text in files.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     return tmp_path
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import textwrap
 from pathlib import Path
 from typing import Annotated
@@ -129,6 +130,10 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     plugins = ["-p", "no:cacheprovider", *([] if there else ["-p", module])]
     # Modules imported before pytest starts do not get rewritten asserts, which is intended.
     plugins += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
+    # The configuration of a project around the files, such as its options and plugins, must not change a verdict.
+    places = [Path(file.partition("::")[0]).absolute() for file in files]
+    root = os.path.commonpath([place if place.is_dir() else place.parent for place in places])
+    plugins += ["-c", os.devnull, "--rootdir", root]
     with bypass_capture(progress_bar(transient=True)) as bar:
         progress = ProgressPlugin(bar)
         status = pytest.main([*plugins, *options, *files], plugins=[progress])
@@ -142,7 +147,7 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     )
     left = len(progress.planned) - sum(counts.values())
     echo(f"{summary}{f', {left} not run' if left > 0 else ''}")
-    if output is not None and (output / "index.html").is_file():
+    if output is not None and status != pytest.ExitCode.USAGE_ERROR:
         echo(f"written  {output / 'index.html'}, results.json, junit.xml")
     if status == pytest.ExitCode.INTERRUPTED and not progress.collecting_failed:
         return _INTERRUPTED
