@@ -45,7 +45,7 @@ BUDGETS = {
     "rig": 53,
     "rig/base": 920,
     "rig/channels": 2417,
-    "rig/cli": 5158,
+    "rig/cli": 5162,
     "rig/physics": 5453,
     "rig/run": 1819,
     "rig/serve": 2849,
