@@ -229,7 +229,7 @@ class Rig(Console):
             raise InputError("duration_s", f"at least one sample, {1.0 / self.daq.rate_hz:g} s", duration_s)
         return self._read_rows(rows)
 
-    def until(self, condition: Callable[[Samples], Any], *, within_s: float, piece_s: float = 0.05) -> Row:
+    def until(self, condition: Callable[[Samples], Any], *, within_s: float, piece_s: float | None = None) -> Row:
         """Read to the first sample that meets a condition; the samples after it remain to be read.
 
         Args:
@@ -237,7 +237,8 @@ class Rig(Console):
                 (rows,).
                 It is called for pieces of the data in order, once for each sample.
             within_s: Simulated time to search, from the next sample on [s].
-            piece_s: Length of a piece [s].
+            piece_s: Length of a piece [s]. A command that follows takes effect at the end of the piece. By default a
+                piece is a block of a rig in lockstep, and 0.05 s of other rigs.
 
         Raises:
             InputError: The condition does not return one boolean per sample.
@@ -247,6 +248,8 @@ class Rig(Console):
         rate = self.daq.rate_hz
         if not 0.0 < within_s < math.inf:
             raise InputError("within_s", "a time above 0", within_s)
+        if piece_s is None:
+            piece_s = self._block_ticks / self._tick_rate_hz if self._is_stepper else 0.05
         left, piece = max(1, round(within_s * rate)), max(1, round(piece_s * rate))
         first_s = last_s = None
         while left > 0:

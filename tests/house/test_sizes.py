@@ -21,7 +21,7 @@ LONGEST_FUNCTION = 120
 SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
-    "drivers": 683,
+    "drivers": 685,
     "drivers/can": 4401,
     "drivers/examples": 86,
     "drivers/instruments": 845,

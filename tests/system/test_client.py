@@ -50,6 +50,7 @@ def test_a_program_reads_the_rows_of_the_model() -> None:
         assert pulse.tick == 300_000  # at the row after the last one read, whatever had been sent
         hit = machine.until(lambda rows: np.hypot(rows["disk_x"], rows["disk_y"]) > 1.2, within_s=0.5)
         assert machine.event("hammer")["tick"] == pulse.tick
+        assert 0 <= machine.note("1.2 mm").tick - hit.tick <= 10_000, "a command takes effect at the end of the block"
         behind = machine.advance(0.01)
         assert behind.index == hit.index + 1
         contact = machine.truth("contact", to_s=0.4)
