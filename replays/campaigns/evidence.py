@@ -176,8 +176,7 @@ class Trial:
         from_s, to_s = max(span[0], about - EVENT_MARGIN_S), min(span[1] + 1e-3, about + EVENT_MARGIN_S)
         clip, picture = folder / "event.mcap", folder / "event.png"
         cut(recording, clip, from_s=from_s, to_s=to_s, force=True)
-        channels = dict.fromkeys(name for each in failed for name in each.channels)
-        draw(Recording.open(clip), picture, failed, origin_s=self.origin_s, channels=list(channels), about_s=about)
+        draw(Recording.open(clip), picture, failed, origin_s=self.origin_s, about_s=about)
         return [clip, picture]
 
     def document(self) -> dict[str, Any]:

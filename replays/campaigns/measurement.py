@@ -101,7 +101,9 @@ class Measurement:
         resolution: Resolution of the value.
         note: Remark, such as the reason for a missing value.
         at_s: Simulated time of the value [s].
-        channels: Channels that the value depends on.
+        channels: Channels that the value depends on; two for the radius of an orbit.
+        since_s: Simulated time that the value is counted from [s].
+        level: Level of the channels that defines the value [unit of the channels].
         open_reason: Reason why the value neither passes nor fails; empty if it does.
     """
 
@@ -114,6 +116,8 @@ class Measurement:
     at_s: float | None = None
     channels: tuple[str, ...] = ()
     open_reason: str = ""
+    since_s: float | None = None
+    level: float | None = None
 
     @property
     def outcome(self) -> Outcome:

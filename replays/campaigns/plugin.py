@@ -36,6 +36,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--rig-against", metavar="FOLDER", help="results of an earlier campaign to compare with")
     group.addoption("--rig-url", metavar="URL", help="run on the rig there instead of on rigs of the tests' own")
     group.addoption("--rig-device", metavar="COMMAND", help="command line of the device under test in TOML campaigns")
+    group.addoption("--rig-limit", metavar="NAME=QUANTITY", action="append", help="limit that replaces the file's")
     group.addoption("--rig-replay", metavar="FILE", help="run on a recording that is played")
 
 
@@ -73,7 +74,7 @@ class CampaignFile(pytest.File):
         from rig.base.errors import InputError
 
         try:
-            campaign = load_campaign(self.path, self.config.option.rig_device)
+            campaign = load_campaign(self.path, self.config.option.rig_device, self.config.option.rig_limit or ())
         except InputError as error:
             raise self.CollectError(str(error)) from None
         for case in campaign.cases:

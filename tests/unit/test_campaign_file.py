@@ -222,6 +222,31 @@ def test_the_command_prints_the_error_and_exits_with_2(tmp_path: Path, capsys: p
         assert says in err
 
 
+def test_device_and_limits_of_a_shipped_campaign_can_be_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").touch()
+    (case,) = load_campaign(
+        campaign_path("protection-trip"), "python mine.py {url} {delay:s} {danger}", ["delay=150 ms", "danger = 2 mm"]
+    ).cases
+    assert case.device is not None
+    assert (case.device.command, case.device.folder) == ("python mine.py {url} 0.15 2 mm", str(tmp_path))
+    for name, device, limits, must in (
+        ("hammer", "python mine.py", [], "--device must be left out, as the campaign has no device"),
+        ("protection-trip", "python other.py", [], "device.command must be a program whose script is there"),
+        (
+            "protection-trip",
+            None,
+            ["dely=1 ms"],
+            "--limit must be NAME=QUANTITY with a limit of the campaign, such as delay",
+        ),
+        ("protection-trip", None, ["delay"], "--limit delay must be a number with its unit"),
+    ):
+        with pytest.raises(InputError, match=must):
+            load_campaign(campaign_path(name), device, limits)
+
+
 SHIPPED = {
     "daq-acceptance": 5, "daq-loss": 2, "fault-endurance": 10, "hammer": 2, "protection-alarms": 2,
     "protection-filter": 2, "protection-inputs": 1, "protection-latch": 1, "protection-ok": 2, "protection-retrip": 1,

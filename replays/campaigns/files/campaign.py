@@ -7,7 +7,7 @@ import itertools
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -169,12 +169,13 @@ def campaign_path(name_or_path: str) -> Path:
     return known.get(name_or_path, path)
 
 
-def load_campaign(path: Path, device: str | None = None) -> Campaign:
+def load_campaign(path: Path, device: str | None = None, limits: Sequence[str] = ()) -> Campaign:
     """Read and check a campaign file.
 
     Args:
         path: The file.
         device: Command line that replaces that of the file's device.
+        limits: Limits that replace those of the file and of its matrix, such as "danger=500 um".
 
     Raises:
         InputError: For the first error, with the file and line.
@@ -200,13 +201,26 @@ def load_campaign(path: Path, device: str | None = None) -> Campaign:
                 raise InputError("--device", "left out, as the campaign has no device", device)
             own = file.device.model_copy(update={"command": device, "folder": str(Path.cwd())})
             file = file.model_copy(update={"device": own})
-        cases = tuple(_cases(path, file))
+        cases = tuple(_cases(path, _replace_limits(file, limits)))
         ids: set[str] = set()
         for case in cases:
             if case.id in ids:
                 raise InputError("matrix", "cases with different names (give the faults an id)", case.id)
             ids.add(case.id)
     return Campaign(file.title, file.about, cases)
+
+
+def _replace_limits(file: _File, limits: Sequence[str]) -> _File:
+    new = {name.strip(): value.strip() for name, _, value in (each.partition("=") for each in limits)}
+    for name, value in new.items():
+        known = {**file.limits, **file.matrix.limits}
+        if name not in known:
+            raise UnknownNameError("--limit", "NAME=QUANTITY with a limit of the campaign", name, known)
+        split_quantity(value, field=f"--limit {name}")
+    matrix = {name: values for name, values in file.matrix.limits.items() if name not in new}
+    return file.model_copy(
+        update={"limits": {**file.limits, **new}, "matrix": file.matrix.model_copy(update={"limits": matrix})}
+    )
 
 
 @contextmanager

@@ -182,7 +182,10 @@ class ExpectSignal(_SignalFields, _Within):
         unit = "s" if self.beyond else "Hz" if self.take == "whirl frequency" else self.unit(units, where="expect")
         exact = f"1 row, {1e6 * row_s:g} us" if self.beyond else ""
         channels = () if self.truth else self.names
-        yield Measurement(self.label, convert_unit(value, unit, must), must, self.source, exact, note, at_s, channels)
+        level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="") if self.beyond else None
+        yield Measurement(
+            self.label, convert_unit(value, unit, must), must, self.source, exact, note, at_s, channels, level=level
+        )
 
     def _value(self, recording: CaseRecording, units: Units) -> tuple[float, float | None, str]:
         times_s, values = self.values(recording)
@@ -273,21 +276,30 @@ class ExpectEvent(_Within):
         times_s = [each for each in self.of.times_s(recording) if self.from_s <= each < to_s]
         if not self.must or self.take == "count":
             at_s = times_s[0] if times_s else None
-            yield Measurement(self.label, float(len(times_s)), must, self.source, at_s=at_s)
+            note = f"at {_list_times(times_s)}" if times_s else ""
+            yield Measurement(self.label, float(len(times_s)), must, self.source, note=note, at_s=at_s)
             return
         exact = "1 tick, 1 us"
         since_s = 0.0 if self.since is None else self.since.time_s(recording, units, from_s=self.from_s)
         # The origin causes the event, so an event before the origin is a different one.
         at_s = next((each for each in times_s if not each < since_s), math.nan)
         note = "" if math.isfinite(at_s) else f"no {self.of} occurred"
+        if note and times_s:
+            note += f" after {since_s:g} s; {len(times_s)} before, at {_list_times(times_s)}"
         note = "the origin of the time never occurred" if math.isnan(since_s) else note
         value = math.nan
         if math.isfinite(at_s - since_s):
             value = (recording.tick(at_s) - recording.tick(since_s)) / recording.tick_rate_hz
         about = at_s if math.isfinite(at_s) else since_s
         channels = () if self.since is None or self.since.truth or not self.since.signal else self.since.names
-        at_s = about if math.isfinite(about) else None
-        yield Measurement(self.label, convert_unit(value, "s", must), must, self.source, exact, note, at_s, channels)
+        since, level = self.since, None
+        if since is not None and channels:
+            level = quantity(since.beyond, since.unit(units, where=""), field="beyond", of="")
+        yield Measurement(
+            self.label, convert_unit(value, "s", must), must, self.source, exact, note,
+            about if math.isfinite(about) else None, channels,
+            since_s=since_s if since is not None and math.isfinite(since_s) else None, level=level,
+        )  # fmt: skip
 
 
 class ExpectOrder(_Within):
@@ -331,6 +343,10 @@ def expected_events(expects: Iterable[Expect]) -> Iterator[EventOf]:
             yield from expect.order
         elif isinstance(expect, ExpectEvent) and expect.appears:
             yield expect.of
+
+
+def _list_times(times_s: list[float]) -> str:
+    return f"{', '.join(f'{each:g}' for each in times_s[:5])}{', ...' if len(times_s) > 5 else ''} s"
 
 
 def _name(names: tuple[str, ...]) -> str:

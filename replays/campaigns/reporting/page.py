@@ -62,7 +62,7 @@ def _seconds(results: Document, case: Document) -> str:
 
 
 def _failure(report: Report, case: Document, folder: Path) -> None:
-    report.heading(f"{case['outcome']}: {case['id']}", note=case["reason"])
+    report.heading(f"{case['outcome']}: {case['id']}", note=case["reason"].partition(" [")[0])
     failed = [each for each in case["measurements"] if each["outcome"] != "pass"]
     if not failed:
         report.text(case["reason"])

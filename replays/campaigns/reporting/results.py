@@ -138,6 +138,7 @@ class Results:
         if whole.parent == Path(__file__).parents[1]:  # a shipped campaign has a name
             file = whole.name.partition(".")[0]
         more = [(f"--{name}", self._config.getoption(f"rig_{name}")) for name in ("url", "replay", "device")]
+        more += [("--limit", each) for each in self._config.getoption("rig_limit") or ()]
         options = [word for option, value in more if value for word in (option, value)]
         return shlex.join(["rig", "campaign", f"{file}{colons}{rest}", *options])
 

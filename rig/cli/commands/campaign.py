@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -44,6 +45,10 @@ def campaign(
         str | None,
         typer.Option(metavar="COMMAND", help="Command line of your device, with the file's placeholders ({url}, ...)"),
     ] = None,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=QUANTITY", help="Replace a limit of the file, as in danger='500 um'; repeatable"),
+    ] = None,
     url: Annotated[
         str | None, typer.Option(metavar="URL", help="Use the rig at this URL; skip cases that it cannot run")
     ] = None,
@@ -69,11 +74,12 @@ def campaign(
         raise InputError("--jobs", "1 with --url, as the cases share one rig", jobs)
     if output is not None:
         check_folder(output, field="--output")
-    files = _checked(files, against, replay, device)
+    files = _checked(files, against, replay, device, limit or ())
     plugin_options = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
     plugin_options["--rig-device"] = device
     options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
     options += ["-k", keyword] if keyword is not None else []
+    options += [word for each in limit or () for word in ("--rig-limit", each)]
     options += ["-x"] if exit_first else []
     options += ["-n", str(jobs)] if jobs > 1 else ["-n", "0"] if importlib.util.find_spec("xdist") else []
     status = _run(files, options, output)
@@ -89,7 +95,9 @@ def _list() -> None:
     echo(f"files in {FOLDER}")
 
 
-def _checked(files: list[str], against: Path | None, replay: Path | None, device: str | None) -> list[str]:
+def _checked(
+    files: list[str], against: Path | None, replay: Path | None, device: str | None, limits: Sequence[str]
+) -> list[str]:
     """Return the paths of the files; raise an error for wrong files before anything runs."""
     from replays.campaigns.files.campaign import SUFFIX, campaign_path, load_campaign
     from replays.campaigns.reporting.results import load_results
@@ -100,7 +108,7 @@ def _checked(files: list[str], against: Path | None, replay: Path | None, device
         name = str(campaign_path(name))
         paths.append(f"{name}{colons}{case}")
         if name.endswith(SUFFIX):
-            known = [each.id for each in load_campaign(Path(name), device).cases]
+            known = [each.id for each in load_campaign(Path(name), device, limits).cases]
             if colons and case not in known:
                 raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
         elif not Path(name).exists():
