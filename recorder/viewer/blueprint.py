@@ -66,6 +66,7 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | N
             play_state="following" if live else "playing",
             playback_speed=1.0,
         ),
+        rrb.TopPanel(state="expanded" if only is None else "hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         auto_layout=False,
