@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import Any
 
@@ -25,7 +26,6 @@ _FAULT, _CLEAR = (int(FaultKind.FAULT),), (int(FaultKind.CLEAR),)
 def fault_signals(channels: ChannelTable) -> tuple[CanSignal, ...]:
     """Return the signals of the first six bytes, except the counter."""
     main_numbers = ", ".join(f"{name}: {kind.main()}" for name, kind in KINDS.items() if kind.main())
-    targets = [*channels.groups, *channels.channels]
     return (
         CanSignal(
             "kind", 0, 8, label="Kind of command", selects=True,
@@ -36,7 +36,7 @@ def fault_signals(channels: ChannelTable) -> tuple[CanSignal, ...]:
             choices=dict(sorted((kind.number, name) for name, kind in KINDS.items())),
         ),
         CanSignal(
-            "target", 24, 8, label="Group or channel", selected_by=_FAULT, choices=dict(enumerate(targets, start=1))
+            "target", 24, 8, label="Group or channel", selected_by=_FAULT, choices=number_targets(channels)
         ),
         CanSignal(
             "number", 32, 12, signed=True, selected_by=_FAULT,
@@ -46,6 +46,24 @@ def fault_signals(channels: ChannelTable) -> tuple[CanSignal, ...]:
         CanSignal("id", 16, 16, label="Number of the fault to end; 0: all", selected_by=_CLEAR),
         CanSignal("reserved", 32, 16, label="Always 0", selected_by=_CLEAR),
     )  # fmt: skip
+
+
+def number_targets(channels: ChannelTable) -> dict[int, str]:
+    """Return the channel groups and channels by their numbers on the bus, from 1."""
+    return dict(enumerate([*channels.groups, *channels.channels], start=1))
+
+
+def fit_number(value: float, *, field: str) -> dict[str, int]:
+    """Return the raw values of `number` and `exponent` nearest to a value, with at least three digits.
+
+    Raises:
+        InputError: The value is too large for them, or not finite.
+    """
+    fits = (e for e in range(-8, 8) if math.isfinite(value) and abs(round(value / 10.0**e)) <= 2047)
+    exponent = next(fits, None)
+    if exponent is None:
+        raise InputError(field, "at most 2.047e10 in a CAN frame", value)
+    return {"number": round(value / 10.0**exponent), "exponent": exponent}
 
 
 def fault_raw(message: CanMessage, channel: str, kind: str, number: float | str | None) -> dict[str, int]:
@@ -65,10 +83,7 @@ def fault_raw(message: CanMessage, channel: str, kind: str, number: float | str 
         raise InputError("number", f"left out: {kind} has no main number", number)
     if isinstance(number, str):
         return raw | {"number": _find_target(number, targets)}
-    exponent = next((e for e in range(-8, 8) if abs(round(number / 10.0**e)) <= 2047), None)
-    if exponent is None:
-        raise InputError(main, "at most 2.047e10 in a CAN frame", number)
-    return raw | {"number": round(number / 10.0**exponent), "exponent": exponent}
+    return raw | fit_number(number, field=main)
 
 
 def fault_request(message: CanMessage, raw: dict[str, int]) -> dict[str, Any] | None:

@@ -27,7 +27,7 @@ from typing import Any
 
 from drivers.can.bus.frame import FD_LENGTHS
 from drivers.can.devices import DeviceRequest, device_messages, parse_device_frame
-from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signals
+from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signals, number_targets
 from drivers.can.message import ABSENT, KEY, CanMessage, CanSignal, MessageTable, SampleLayout, checksum
 from rig.base.errors import InputError
 from rig.channels.table import Channel, ChannelTable, default_table
@@ -345,7 +345,7 @@ def _classic_messages(table: ChannelTable) -> list[CanMessage]:
 
 def make_table(channels: ChannelTable) -> MessageTable:
     """Build all messages for a channel table."""
-    devices = device_messages(RIG, CONTROLLER, _TIME)
+    devices = device_messages(RIG, CONTROLLER, _TIME, number_targets(channels))
     samples = [*_fd_messages(channels), *_classic_messages(channels)]
     rows = [*_other_messages(), _fault_message(channels), *devices, *samples]
     return MessageTable(tuple(sorted(rows, key=lambda row: row.identifier)))
@@ -482,7 +482,7 @@ def parse_command(
         return Result.BAD_KEY
     message = (table or default_messages()).by_identifier[identifier]
     if message.name == "Device":
-        return parse_device_frame(message.decode(data)) or Result.BAD_KIND
+        return parse_device_frame(message, data) or Result.BAD_KIND
     try:
         kind = FaultKind(data[0]) if message.name == "Fault" else CommandKind(data[0])
     except ValueError:

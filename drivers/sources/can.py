@@ -7,6 +7,7 @@ The source only acknowledges frames; it sends what `send` receives.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -366,7 +367,10 @@ class CanSource:
         """Leave the bus; further calls have no effect."""
         if self._closed:
             return
+        import can
+
         self._closed = True
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)
-        self._bus.shutdown()
+        with contextlib.suppress(can.CanError):  # its adapter may be gone
+            self._bus.shutdown()

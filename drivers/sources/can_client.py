@@ -1,7 +1,8 @@
 """Client of a rig on a CAN bus: commands as acknowledged frames, and the rig's events as far as frames carry them.
 
-Requests for which the bus has no frame are refused here by name: truth tables, notes, steps, and fault fields except
-the main one. A device under test is identified by its node number.
+Requests for which the bus has no frame are refused here by name: truth tables, steps, and fault fields except the main
+one. A note is sent by a tag that is a kind of note, and its channel; the rig builds the text. A device under test is
+identified by its node number.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from drivers.can.devices import DeviceKind, DeviceState, device_frame, device_name
+from drivers.can.devices import DeviceKind, DeviceState, NoteKind, device_frame, device_name, note_frame, sender_frame
 from drivers.can.signals import (
     EVENT_VALUES,
+    MAX_LEAD,
     CommandKind,
     EventKind,
     Field,
@@ -177,6 +179,8 @@ class CanClient(Closing):
         with self._request_lock:
             if command in ("join", "done", "leave"):
                 return wire.encode_document(self._device(DeviceKind[command.upper()], fields, timeout_s))
+            if command == "note":
+                return wire.encode_document(self._note(fields))
             return wire.encode_document(self._command(command, fields, timeout_s))
 
     def _build_status(self) -> dict[str, Any]:
@@ -233,10 +237,13 @@ class CanClient(Closing):
 
     def _send_command(self, command: str, fields: Mapping[str, Any], timeout_s: float) -> dict[str, int]:
         """Send a command, and return its Acknowledge."""
-        counter = ((self._counter or 0) + 1) & 0xFF
+        # Devices that share the counter lead it by different numbers, so that each knows its own Acknowledge.
+        counter = ((self._counter or 0) + 1 + (self.node - 1) % MAX_LEAD) & 0xFF
         frame = self._frame(command, fields, counter)
         while not self._acknowledgements.empty():
             self._acknowledgements.get()
+        if self._joined:
+            self.source.send(*sender_frame(self.source.table.by_name["Device"], self.node, frame[1]))
         self.source.send(*frame)
         deadline = Deadline(timeout_s)
         while True:
@@ -246,6 +253,20 @@ class CanClient(Closing):
                 raise NoReplyError(f"the rig on this bus did not acknowledge {command} in {timeout_s:g} s") from None
             if answer["counter"] == counter:
                 return answer
+
+    def _note(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Send a note as the device with this node's number; a bus has no reply to it."""
+        kinds = {kind.tag: kind for kind in NoteKind}
+        found = [kinds[tag] for tag in fields["tags"] if tag in kinds]
+        if not found:
+            raise InputError("tags", f"with one of {', '.join(kinds)} over CAN", fields["tags"])
+        words = str(fields["text"]).split()
+        channel = next((word for word in words if word in self.source.channels.channels), None)
+        alarm = next((kinds[word] for word in words if word in kinds and kinds[word] is not found[0]), None)
+        ends = found[0] in (NoteKind.CLEAR, NoteKind.RESET)
+        message = self.source.table.by_name["Device"]
+        self.source.send(*note_frame(message, found[0], self.node, channel=channel, alarm=alarm if ends else None))
+        return {"accepted": True, "id": 0, "tick": self._tick, "time_s": self._tick * _US}
 
     def _device(self, kind: DeviceKind, fields: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         """Join, finish a block or leave as the device with this node's number; the name in the request is ignored."""

@@ -91,7 +91,8 @@ class Trial:
             command, name=name, bench=bench, log=self.folder / f"{name}.log", where=where, files=self.folder
         )
         self.devices.append(device)
-        if bench.pace == "lockstep" if joins is None else joins:
+        device.joins = bench.pace == "lockstep" if joins is None else joins
+        if device.joins:
             device.wait_until_joined()
         else:
             device.wait_until_linked(before)
@@ -108,7 +109,10 @@ class Trial:
     @property
     def resolution(self) -> str:
         """Resolution of reaction times, in words."""
-        return "" if self.bench is None else self.bench.resolution
+        if self.bench is None:
+            return ""
+        outside = [device.name for device in self.devices if not device.joins and self.bench.pace == "lockstep"]
+        return self.bench.resolution + (f", but not for {' and '.join(outside)}, which did not join" if outside else "")
 
     def take(self, measurement: Measurement) -> Measurement:
         """Add a measurement and return it with run-specific names replaced."""
@@ -126,8 +130,11 @@ class Trial:
     def mask_addresses(self, text: str) -> str:
         """Replace the folders, ports and names of this run in a text, so that every run gives the same text."""
         masked = text.replace(str(self.folder), "{folder}")
-        for address in () if self.bench is None else (self.bench.can_url, self.bench.url, self.bench.name):
-            masked = masked.replace(address.partition(":")[2] or address, "{rig}") if address else masked
+        bench = self.bench
+        urls = () if bench is None else (bench.can_url, bench.url)
+        addresses = () if bench is None else (bench.socketcand_url, bench.slcan_path, bench.name)
+        for address in filter(None, (*((url or "").partition(":")[2] for url in urls), *addresses)):
+            masked = masked.replace(address, "{rig}")
         return masked
 
     def close(self, *, failed: bool) -> None:

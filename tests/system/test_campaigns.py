@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -152,6 +153,96 @@ def test_a_device_in_lockstep_gets_the_same_verdict_each_time(folder: Path) -> N
     # A repeated run is identical, byte for byte.
     assert well["repeat"] == "rig campaign x.campaign.toml::how=well"
     assert json.dumps(again).replace("how=again", "how=well") == json.dumps(well)
+
+
+CAN_DEVICE = """
+import sys
+import rig
+
+url, kind, text = sys.argv[1:]
+assert text == "{url}", text
+with rig.connect(url, channels=["disk_x"], name="over CAN") as machine:
+    sent = False
+    for samples in machine.blocks():
+        if not sent and abs(samples["disk_x"]).max() > 0.3:
+            machine.note(kind + " disk_x", tags=[kind])
+            if kind == "alert":
+                machine.speed(4.0)
+            sent = True
+"""
+CAN_CAMPAIGN = """
+title = "Devices on a bus, in three ways"
+scene = "stable-run"
+duration_s = 0.3
+can = true
+
+[[devices]]
+command = "./plain_device {socketcand} 500"
+name = "c"
+
+[[devices]]
+command = "python can_device.py {can}&node=3 alert {{url}}"
+name = "node3"
+
+[[devices]]
+command = "python can_device.py can:slcan:{slcan}?node=4 not-ok {{url}}"
+name = "node4"
+
+[[steps]]
+at_s = 0.1
+command = "hammer"
+
+[[expect]]
+event = "note"
+where = { tags = "danger", from = "CAN 7" }
+text = "danger disk_x "
+since = { signal = ["disk_x", "disk_y"], beyond = "500 um" }
+must = "<= 10 ms"
+
+[[expect]]
+event = "command"
+where = { command = "speed", from = "CAN 7", "request.speed_hz" = 0.0 }
+
+[[expect]]
+event = "command"
+where = { command = "speed", from = "CAN 3", "request.speed_hz" = 4.0 }
+
+[[expect]]
+order = [
+  { event = "note", where = { tags = "alert", from = "CAN 3" }, text = "alert disk_x" },
+  { event = "note", where = { tags = "danger" } },
+  { event = "note", where = { tags = "trip", from = "CAN 7" } },
+]
+
+[[expect]]
+event = "note"
+where = { tags = "not-ok", from = "CAN 4" }
+
+[[expect]]
+event = "device"
+where = { state = "joined" }
+take = "count"
+must = "== 3"
+"""
+
+
+def test_devices_on_a_bus_take_part_by_socketcand_slcan_and_zenoh(tmp_path: Path) -> None:
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("this machine has no C compiler (cc)")
+    source = processes.ROOT / "docs/plain_device.c"
+    warnings = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+    subprocess.run([compiler, *warnings, "-o", "plain_device", source, "-lm"], cwd=tmp_path, check=True)
+    (tmp_path / "can_device.py").write_text(CAN_DEVICE, encoding="utf-8")
+    (tmp_path / "can.campaign.toml").write_text(CAN_CAMPAIGN, encoding="utf-8")
+    out, document = run_campaign(tmp_path, "can.campaign.toml", status=0)
+    (case,) = document["cases"]
+    assert [each["good"] for each in case["measurements"]] == [True] * len(case["measurements"])
+    names = [each["name"] for each in case["measurements"]]
+    assert [f"times that {name} was lost" for name in ("c", "node3", "node4")] == [
+        name for name in names if name.startswith("times that")
+    ]
+    assert "1 passed" in out
 
 
 SLOW_CAMPAIGN = """

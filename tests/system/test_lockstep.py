@@ -125,8 +125,11 @@ def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
     spec = f"can:zenoh:can0?endpoint=127.0.0.1:{hub}&node=3"
     with bench("--can", spec.removeprefix("can:").partition("&")[0]) as (machine, _):
         with rig.connect(spec, channels=["disk_x", "P_E"]) as device:
-            with pytest.raises(InputError, match="command must be one with a CAN frame"):
-                device.note("over CAN")
+            with pytest.raises(InputError, match="tags must be with one of alert, danger"):
+                device.note("over CAN", tags=["protection"])
+            device.note("0.1 s  clear  danger disk_x  512", tags=["protection", "clear"])
+            note = machine.event("note", timeout_s=PATIENCE_S)
+            assert (note["text"], note["tags"], note["from"]) == ("clear danger disk_x", ["clear"], "CAN 3")
             with pytest.raises(InputError, match="fault must be with only its main number"):
                 device.fault("P_E", "gain", factor=2.0, for_s=1.0)
             with pytest.raises(RefusedError, match="speed was refused over CAN: out of range"):

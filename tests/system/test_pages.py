@@ -2,7 +2,8 @@
 
 A line of a block with "first terminal" in its comment runs in parallel to the others, until the page's next use of that
 terminal or its end; "ends with 1" is the expected exit status. Directives for this test are in a comment above a block:
-`file: NAME` (save it), `long: HOW LONG` (run with RIG_LONG_PAGES=1), `elsewhere: WHY` (never run here).
+`file: NAME` (save it), `long: HOW LONG` (run with RIG_LONG_PAGES=1), `needs: PROGRAM` (run where it is installed),
+`elsewhere: WHY` (never run here).
 """
 
 from __future__ import annotations
@@ -90,6 +91,8 @@ class Reader:
         """Execute one block."""
         what, _, rest = directive.partition(": ")
         if what == "elsewhere" or (what == "long" and not _RUNS_LONG_BLOCKS):
+            return
+        if what == "needs" and shutil.which(rest) is None:
             return
         if what == "file":
             (self.folder / rest).write_text(text, encoding="utf-8")

@@ -6,12 +6,18 @@ from pathlib import Path
 
 import pytest
 
+from replays.campaigns.equipment.device import fill_placeholders
 from replays.campaigns.files.campaign import Campaign, campaign_path, find_shipped, load_campaign, read_title
 from replays.campaigns.files.line_numbers import number_lines
 from rig.base.errors import InputError
 from tests.commands import run_captured
 
 HEAD = 'title = "T"\nscene = "hammer"\n'
+TWO = (
+    '[[devices]]\ncommand = "python -m json.tool"\nname = "one"\n'
+    '[[devices]]\ncommand = "python -m y.tool"\nname = "two"\n'
+)
+OUTSIDE = 'device = { command = "python -m json.tool", joins = false, name = "out" }\n'
 PEAK = '[[expect]]\nsignal = "disk_x"\nmust = "<= 2 mm"\n'
 
 
@@ -114,12 +120,12 @@ WRONG = {
     "unknown place": (
         HEAD + '[device]\ncommand = "python -m json.tool {danger}"\n' + PEAK,
         4,
-        "a text with names of [limits] or [matrix.device] between braces, such as",
+        "a text with known names in braces, such as",
     ),
     "misspelt place": (
         HEAD + '[limits]\ndanger = "2 mm"\n' + PEAK.replace("2 mm", "{dangr}"),
         7,
-        "expect.must must be a text with names of [limits] or [matrix.device] between braces, such as danger; received",
+        "expect.must must be a text with known names in braces, such as danger; received",
     ),
     "limit that is a number": (
         HEAD + "[limits]\ndanger = 2\n" + PEAK,
@@ -145,6 +151,63 @@ WRONG = {
         HEAD + '[device]\ncommand = "python -m json.tool {can}"\n' + PEAK,
         4,
         "without {can} unless can = true",
+    ),
+    "socketcand without a bus": (
+        HEAD + '[device]\ncommand = "python -m json.tool {socketcand}"\n' + PEAK,
+        4,
+        "without {socketcand} unless can = true",
+    ),
+    "SLCAN without a bus": (
+        HEAD + '[device]\ncommand = "python -m json.tool {{{slcan}}}"\n' + PEAK,
+        4,
+        "without {slcan} unless can = true",
+    ),
+    "single brace": (
+        HEAD + '[device]\ncommand = "awk \'{print}\' { x"\nname = "a"\n' + PEAK,
+        4,
+        "device.command must be a text with known names in braces",
+    ),
+    "brace of nothing": (
+        HEAD + '[device]\ncommand = "python -m json.tool }"\n' + PEAK,
+        4,
+        "device.command must be a text with {url}, {can}, {socketcand}, {slcan}, {name}, {folder}, and {{ or }} for a",
+    ),
+    "device and devices": (
+        HEAD + TWO.replace("[[devices]]", "[device]", 1) + PEAK,
+        6,
+        "devices must be left out with [device]; received 1",
+    ),
+    "two devices of one name": (
+        HEAD + TWO.replace('"two"', '"one"') + PEAK,
+        8,
+        "devices.name must be another name than rig and those of other devices; received 'one'",
+    ),
+    "a device named as the rig": (HEAD + TWO.replace('"one"', '"rig"') + PEAK, 5, "another name than rig"),
+    "missing program of the second": (
+        HEAD + TWO.replace("y.tool", "y.tool {urll}") + PEAK,
+        7,
+        "devices.command must be a text with known names in braces, such as url",
+    ),
+    "events of a device outside lockstep": (
+        HEAD + OUTSIDE + '[[expect]]\nevent = "note"\nwhere = { tags = "trip", from = "out" }\n',
+        4,
+        "expect must be about events whose time is exact, not of out: the rig does not wait for it in lockstep (use "
+        "joins = true, or pace = \"real-time\"); received 'note tags=trip from=out'",
+    ),
+    "no event of a device outside lockstep": (
+        HEAD + OUTSIDE + '[[expect]]\nevent = "note"\nappears = false\n',
+        4,
+        "not of out",
+    ),
+    "order of events of a device outside lockstep": (
+        HEAD + OUTSIDE + '[[expect]]\norder = [{ event = "hammer" }, { event = "note", where = { from = "CAN 7" } }]\n',
+        4,
+        "not of out",
+    ),
+    "time since an event of a device outside lockstep": (
+        HEAD + OUTSIDE + '[[expect]]\nevent = "end"\nsince = { event = "note" }\nmust = "<= 1 s"\n',
+        4,
+        "not of out",
     ),
     "about nothing": (
         HEAD + '[[expect]]\nmust = "<= 2 mm"\n',
@@ -230,10 +293,10 @@ def test_device_and_limits_of_a_shipped_campaign_can_be_replaced(
     (case,) = load_campaign(
         campaign_path("protection-trip"), "python mine.py {url} {delay:s} {danger}", ["delay=150 ms", "danger = 2 mm"]
     ).cases
-    assert case.device is not None
-    assert (case.device.command, case.device.folder) == ("python mine.py {url} 0.15 2 mm", str(tmp_path))
+    (found,) = case.devices
+    assert (found.command, found.folder) == ("python mine.py {url} 0.15 2 mm", str(tmp_path))
     for name, device, limits, must in (
-        ("hammer", "python mine.py", [], "--device must be left out, as the campaign has no device"),
+        ("hammer", "python mine.py", [], "--device must be left out, as the campaign has no .device."),
         ("protection-trip", "python other.py", [], "device.command must be a program whose script is there"),
         (
             "protection-trip",
@@ -312,8 +375,8 @@ def test_a_matrix_is_the_product_of_its_axes(tmp_path: Path) -> None:
     campaign = load(tmp_path, MATRIX)
     assert len(campaign.cases) == 2 * 2 * 2 * 2
     case = {each.id: each for each in campaign.cases}["stable-run,disk_x-stuck,danger=300um,vote=1oo2"]
-    assert case.device is not None
-    assert case.device.command == "python -m json.tool {url} --danger-um 300 --vote 1oo2 {name}"
+    (device,) = case.devices
+    assert device.command == "python -m json.tool {url} --danger-um 300 --vote 1oo2 {name}"
     assert [(step.at_s, step.note or step.command.request.channel) for step in case.steps if step] == [
         (0.1, "disk_x"),
         (0.2, "danger is 300 um"),
@@ -329,3 +392,58 @@ def test_line_numbers_inside_tables_lists_and_inline_tables() -> None:
         "a.b": 1, "c": 4, "c.0": 4, "c.0.d": 5, "c.0.d.0": 5, "c.0.d.1": 6, "c.0.d.1.e.f": 6, "c.0.g": 8, "c.0.g.h": 9,
         "c.1": 10, "c.1.i": 11,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "expect",
+    [
+        'event = "hammer"\n',
+        'event = "note"\n',
+        'event = "note"\nwhere = { from = "campaign" }\n',
+        'event = "command"\nwhere = { from = "in" }\n',
+        'event = "speed"\n',
+    ],
+)
+def test_a_device_outside_lockstep_leaves_other_events_to_the_campaign(expect: str, tmp_path: Path) -> None:
+    devices = OUTSIDE.replace("device = ", "devices = [").strip() + ', { command = "python", name = "in" }]\n'
+    steps = '[[steps]]\nat_s = 1.0\nnote = "now"\n'
+    assert load(tmp_path, HEAD + devices + steps + "[[expect]]\n" + expect).cases
+
+
+def test_a_device_outside_lockstep_may_be_judged_in_real_time_and_by_its_file(tmp_path: Path) -> None:
+    expect = '[[expect]]\nevent = "note"\nwhere = { from = "out" }\n'
+    assert load(tmp_path, HEAD + 'pace = "real-time"\n' + OUTSIDE + expect).cases
+    listens = OUTSIDE.replace("joins", "commands = false, joins")
+    assert load(tmp_path, HEAD + listens + '[[expect]]\nevent = "command"\nappears = false\n').cases
+    with pytest.raises(InputError, match="not of out"):
+        load(tmp_path, HEAD + listens + expect)
+
+
+@pytest.mark.parametrize(
+    ("text", "command"),
+    [
+        ("{{word}} {url}", "{word} U"),
+        ("{{{url}}}", "{U}"),
+        ("{{{{", "{{"),
+        ("{how} {{url}}", "{url} x {url}"),
+        ('{{"a": {{"b": {number}}}}}', '{"a": {"b": 3}}'),
+    ],
+)
+def test_two_braces_are_one_brace_of_the_text(text: str, command: str, tmp_path: Path) -> None:
+    matrix = '[matrix.device]\nhow = ["{url} x"]\nnumber = [3]\n'
+    device = f"[device]\ncommand = 'python -m json.tool {text}'\n"
+    (case,) = load(tmp_path, HEAD + device + matrix + PEAK).cases
+    (found,) = case.devices
+    assert fill_placeholders(found.command, {"url": "U"}, "command") == f"python -m json.tool {command}"
+    note = '[[steps]]\nat_s = 0.1\nnote = "{{now}}"\n'
+    assert load(tmp_path, HEAD + note + PEAK).cases[0].steps[0].note == "{now}"
+
+
+def test_several_devices_start_in_order_and_share_the_values_of_the_matrix(tmp_path: Path) -> None:
+    matrix = '[matrix.device]\nhow = ["a", "b"]\n'
+    one, two = load(tmp_path, HEAD + TWO.replace("tool", "tool {how} {name}") + matrix + PEAK).cases
+    assert [device.name for device in one.devices] == ["one", "two"]
+    assert [device.command for device in two.devices] == [
+        "python -m json.tool b {name}",
+        "python -m y.tool b {name}",
+    ]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.can import analysis
 from drivers.can.bus.timing import speed
-from drivers.can.devices import DeviceKind, DeviceRequest, device_frame
+from drivers.can.devices import DeviceKind, DeviceRequest, NoteKind, device_frame, note_frame, sender_frame
 from drivers.can.message import checksum, crc8
 from drivers.can.schedule import Schedule, schedule_from
 from drivers.can.signals import (
@@ -283,9 +284,8 @@ def test_random_frames_are_not_commands_at_the_rate_of_the_checksum() -> None:
 
 def test_device_frames_are_decoded_and_all_others_refused() -> None:
     message = TABLE.by_name["Device"]
-    decoded = {
-        kind: parse_command(*device_frame(message, kind, 7, block=300, patience_s=2.5), 0) for kind in DeviceKind
-    }
+    kinds = (DeviceKind.JOIN, DeviceKind.DONE, DeviceKind.LEAVE)
+    decoded = {kind: parse_command(*device_frame(message, kind, 7, block=300, patience_s=2.5), 0) for kind in kinds}
     assert decoded == {
         DeviceKind.JOIN: DeviceRequest(DeviceKind.JOIN, 7, {"device": "CAN 7", "patience_s": 2.5}),
         DeviceKind.DONE: DeviceRequest(DeviceKind.DONE, 7, {"device": "CAN 7", "block": 300}),
@@ -300,3 +300,70 @@ def test_device_frames_are_decoded_and_all_others_refused() -> None:
     assert parse_command(identifier, data[:7], 0) is Result.BAD_LENGTH
     with pytest.raises(InputError, match="device must be one with a node from 0 to 255"):
         device_frame(message, DeviceKind.JOIN, 256)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "text"),
+    [
+        (NoteKind.DANGER, {"channel": "disk_x", "value": 512.4}, "danger disk_x 512"),
+        (NoteKind.ALERT, {"channel": "probes", "value": -0.0123}, "alert probes -0.0123"),
+        (NoteKind.NOT_OK, {"channel": "disk_y", "value": 0.0}, "not-ok disk_y 0"),
+        (NoteKind.TRIP, {}, "trip"),
+        (NoteKind.CLEAR, {"alarm": NoteKind.SPEED_LOST}, "clear speed-lost"),
+        (NoteKind.RESET, {"alarm": NoteKind.DANGER, "channel": "disk_x"}, "reset danger disk_x"),
+        (NoteKind.ROWS_LOST, {"value": 2e9}, "rows-lost 2e+09"),
+    ],
+)
+def test_a_note_of_a_device_has_its_tag_channel_and_value(kind: NoteKind, fields: dict[str, Any], text: str) -> None:
+    identifier, data = note_frame(TABLE.by_name["Device"], kind, 7, **fields)
+    found = parse_command(identifier, data, 0)
+    assert found == DeviceRequest(DeviceKind.NOTE, 7, {"text": text, "tags": [kind.tag]})
+
+
+def test_kinds_of_notes_keep_their_numbers() -> None:
+    tags = [
+        "alert",
+        "danger",
+        "not-ok",
+        "trip",
+        "clear",
+        "reset",
+        "overspeed",
+        "speed-lost",
+        "rows-lost",
+        "on",
+        "reverse",
+    ]
+    assert {kind.tag: int(kind) for kind in NoteKind} == {tag: number for number, tag in enumerate(tags, start=1)}
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        {"note": 0}, {"note": 15}, {"note": 2, "alarm": 1}, {"note": 5, "alarm": 12}, {"note": 2, "channel": 21},
+        {"note": 2, "channel": 255}, {"note": 2, "number": -2048, "exponent": 1},
+    ],
+)  # fmt: skip
+def test_a_note_with_an_invalid_field_is_refused(raw: dict[str, int]) -> None:
+    message = TABLE.by_name["Device"]
+    frame = message.encode(kind=int(DeviceKind.NOTE), node=7, key=KEY, **raw)
+    assert parse_command(message.identifier, frame[:7] + bytes([checksum(0x23, frame)]), 0) is Result.BAD_KIND
+
+
+def test_a_note_that_does_not_fit_its_frame_is_refused() -> None:
+    message = TABLE.by_name["Device"]
+    with pytest.raises(InputError, match="name of a channel or channel group, such as disk_y"):
+        note_frame(message, NoteKind.DANGER, 7, channel="disk_z")
+    for value in (math.nan, math.inf, 3e10):
+        with pytest.raises(InputError, match=r"note\.value must be at most 2.047e10 in a CAN frame"):
+            note_frame(message, NoteKind.DANGER, 7, value=value)
+
+
+def test_a_device_announces_the_counter_and_checksum_of_its_command() -> None:
+    message, command = TABLE.by_name["Device"], command_frame(CommandKind.SPEED, 9, speed_hz=1.0)[1]
+    identifier, data = sender_frame(message, 7, command)
+    assert parse_command(identifier, data, 0) == DeviceRequest(
+        DeviceKind.COMMAND, 7, {"counter": 9, "signature": command[7]}
+    )
+    wrong = data[:5] + b"\1" + data[6:7]
+    assert parse_command(identifier, wrong + bytes([checksum(identifier, wrong)]), 0) is Result.BAD_KIND

@@ -10,9 +10,13 @@ from typing import Any
 
 import pytest
 
+from drivers.can.devices import DeviceKind, NoteKind, device_frame, note_frame, sender_frame
+from drivers.can.gateway.commands import Commands
+from drivers.can.signals import CommandKind, command_frame, default_messages
 from drivers.console import AcceptedStep, Console
 from rig.base import wire
 from rig.base.errors import RefusedError
+from rig.serve.health import Guard
 from rig.serve.pacing import FreeRun, Lockstep
 from rig.serve.transport.memory import MemoryClient
 from tests.unit.service_fake import FakeSimulation
@@ -254,6 +258,65 @@ def test_commands_of_two_devices_at_one_tick_are_ordered_by_name() -> None:
         assert numbers == [6, 7]
         assert steps.join()[0].lost == {}
     assert [event["request"] for event in rig.listener.named("command")[-2:]] == [{"speed_hz": 1.0}, {"speed_hz": 2.0}]
+
+
+@contextmanager
+def commands_of(rig: Running) -> Iterator[Commands]:
+    commands = Commands(
+        MemoryClient(rig.server), lambda **_: None, lambda node: None, timeout_s=1.0, guard=Guard("commands")
+    )
+    thread = threading.Thread(target=commands.send_all, daemon=True)
+    thread.start()
+    try:
+        yield commands
+    finally:
+        commands.close()
+        thread.join(20.0)
+    assert not thread.is_alive()
+
+
+def test_notes_and_commands_of_devices_on_a_bus_are_ordered_by_name_and_never_hold_up_a_done() -> None:
+    message = default_messages().by_name["Device"]
+    speed = [command_frame(CommandKind.SPEED, counter, speed_hz=float(counter)) for counter in (1, 2, 3)]
+    with running() as rig, commands_of(rig) as commands:
+        for node in (3, 7):
+            commands.take(*device_frame(message, DeviceKind.JOIN, node))
+        until(lambda: len(rig.console.status()["devices"]) == 2)
+        steps = Steps(rig, BLOCK)
+        until(lambda: rig.console.status()["tick"] == BLOCK)
+        commands.take(*note_frame(message, NoteKind.DANGER, 7, channel="disk_x", value=512.0))
+        commands.take(*sender_frame(message, 7, speed[0][1]))
+        commands.take(*speed[0])
+        commands.take(*device_frame(message, DeviceKind.DONE, 7, block=1))
+        commands.take(*speed[1])  # of nobody that was announced: not held up
+        until(lambda: commands.accepted == 1)
+        time.sleep(1.1)  # longer than a command may wait for its reply
+        commands.time_out()
+        assert not rig.listener.named("note")
+        commands.take(*sender_frame(message, 3, speed[0][1]))  # announces another command
+        commands.take(*sender_frame(message, 3, speed[2][1]))
+        commands.take(*speed[2])
+        commands.take(*note_frame(message, NoteKind.TRIP, 3))
+        commands.take(*device_frame(message, DeviceKind.DONE, 3, block=1))
+        assert steps.join()[0].lost == {}
+        assert not commands.refused
+    notes = [(each["from"], each["text"], each["tags"], each["tick"]) for each in rig.listener.named("note")]
+    assert notes == [("CAN 3", "trip", ["trip"], BLOCK), ("CAN 7", "danger disk_x 512", ["danger"], BLOCK)]
+    sent = [(each["from"], each["request"]["speed_hz"]) for each in rig.listener.named("command")
+            if each["command"] == "speed"]  # fmt: skip
+    assert sent == [("CAN", 2.0), ("CAN 3", 3.0), ("CAN 7", 1.0)]
+
+
+def test_an_invalid_note_on_a_bus_is_counted_and_has_no_effect() -> None:
+    message = default_messages().by_name["Device"]
+    with running() as rig, commands_of(rig) as commands:
+        identifier, data = note_frame(message, NoteKind.DANGER, 7, channel="disk_x")
+        for wrong in (data[:7] + b"\0", data[:7], data[:2] + b"\xff" + data[3:]):
+            commands.take(identifier, wrong)
+        assert dict(commands.refused) == {"bad_checksum": 2, "bad_length": 1}
+        commands.take(identifier, data)
+        until(lambda: len(rig.listener.named("note")) == 1)
+    assert [each["from"] for each in rig.listener.named("note")] == ["CAN 7"]
 
 
 def test_a_stop_refuses_waiting_requests() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections import Counter, deque
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import pydantic
 
-from drivers.can.devices import DeviceRequest
+from drivers.can.devices import DeviceKind, DeviceRequest, device_name
 from drivers.can.message import MessageTable
 from drivers.can.signals import FIELDS, LIMITS, Command, CommandKind, Field, Result, default_messages, parse_command
 from rig.base import wire
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 _MAX_PENDING = 16
 """Largest number of commands that wait for the rig."""
 IDENTIFIERS = [default_messages().by_name[name].identifier for name in ("Stop", "Command", "Fault", "Device")]
+_ORDER_TIMEOUT_S = 3600.0
+"""Longest wait of a device's note or command for devices that precede it by name [s]: the largest patience."""
 _MAX_REFUSALS_PER_S = 50.0
 _MAX_REFUSAL_BURST = 20.0
 
@@ -37,6 +40,11 @@ class _PendingCommand:
 
     command: Command | DeviceRequest
     deadline_s: float
+    device: str = ""
+    """Name of the device that sent it; empty for a command that no device has announced."""
+    ordered: bool = False
+    """Whether the rig orders it by the device's name, so that it may have to wait for other devices."""
+    started: bool = False
     answered: bool = False
 
 
@@ -99,6 +107,8 @@ class Commands:
         self._refusal_limit = Bucket(_MAX_REFUSALS_PER_S, _MAX_REFUSAL_BURST, now())
         self.waiting: deque[_PendingCommand] = deque()
         """Commands that wait for the rig."""
+        self._announced: dict[int, tuple[int, str]] = {}
+        """Checksum of a command that a device has announced, and its name, by the command's counter."""
         self.counter = 0
         """Counter of the last command that reached the rig."""
         self.accepted = 0
@@ -125,7 +135,17 @@ class Commands:
         if isinstance(command, Result):
             self._refuse(command, None if len(data) < 2 else data[1])
             return
-        item = _PendingCommand(command, self._now() + self._timeout_s)
+        if isinstance(command, Command):
+            signature, device = self._announced.pop(command.counter, (-1, ""))
+            device, ordered = device if signature == data[7] else "", signature == data[7]
+        else:
+            device, ordered = device_name(command.node), command.kind is DeviceKind.NOTE
+            if command.kind is DeviceKind.COMMAND:
+                self._announced[command.values["counter"]] = command.values["signature"], device
+                return
+        # A device's frame may have to wait for its earlier ones: its time begins when it is sent.
+        deadline_s = math.inf if device else self._now() + self._timeout_s
+        item = _PendingCommand(command, deadline_s, device, ordered)
         with self._work:
             if len(self.waiting) >= _MAX_PENDING:
                 self._refuse(Result.BUSY, command)
@@ -133,31 +153,53 @@ class Commands:
             if isinstance(command, Command):
                 # The counter is used up whatever the rig replies, so that the same frame is not accepted twice.
                 self.counter = command.counter
+            item.started = command.kind is CommandKind.STOP
             self.waiting.append(item)
-            if command.kind is not CommandKind.STOP:
-                self._work.notify_all()
+            self._work.notify_all()
         if command.kind is CommandKind.STOP:
             # A stop does not wait for other commands.
-            threading.Thread(target=self._guard, args=(self._send, item), name="can gateway stops", daemon=True).start()
+            self._send_aside(item)
 
     def send_all(self) -> None:
-        """Send one command after another to the rig, until `close`."""
+        """Send one command after another to the rig, until `close`; a device's next one follows the reply to its last.
+
+        Notes and commands of devices may have to wait for the `done` of another device, which must not wait for them.
+        """
         while True:
             with self._work:
-                waiting = [row for row in self.waiting if not row.answered and row.command.kind is not CommandKind.STOP]
-                if not waiting:
-                    if self._stopping:
+                item = self._find_next()
+                if item is None:
+                    if self._stopping and all(row.started for row in self.waiting):
                         return
                     self._work.wait(0.2)
                     continue
-            self._guard(self._send, waiting[0])
+                item.started = True
+                if item.device and not item.ordered:
+                    item.deadline_s = self._now() + self._timeout_s
+            if item.ordered:
+                self._send_aside(item)
+            else:
+                self._guard(self._send, item)
+
+    def _find_next(self) -> _PendingCommand | None:
+        """Return the oldest command that is not sent, of a device without an earlier one in the list."""
+        busy: set[str] = set()
+        for row in self.waiting:
+            if not row.started and row.device not in busy:
+                return row
+            busy.update([row.device] if row.device else [])
+        return None
+
+    def _send_aside(self, item: _PendingCommand) -> None:
+        threading.Thread(target=self._guard, args=(self._send, item), name="can gateway waits", daemon=True).start()
 
     def _send(self, item: _PendingCommand) -> None:
         command = item.command
-        request = wire.encode_document({"from": "CAN", **command.values})
+        request = wire.encode_document({"from": item.device if item.ordered else "CAN", **command.values})
+        timeout_s = _ORDER_TIMEOUT_S if item.ordered else self._timeout_s
         try:
             key = wire.command_key(command.kind.name.lower())
-            reply = check(_Reply, self._client.request(key, request, timeout_s=self._timeout_s), field="reply")
+            reply = check(_Reply, self._client.request(key, request, timeout_s=timeout_s), field="reply")
         except Exception as error:
             reply = None
             if not isinstance(error, (NoReplyError, ValueError)):
@@ -189,6 +231,7 @@ class Commands:
             item.answered = True
             with contextlib.suppress(ValueError):
                 self.waiting.remove(item)
+            self._work.notify_all()
             return True
 
     def time_out(self) -> None:
@@ -222,6 +265,8 @@ class Commands:
     ) -> None:
         """Count and report the refusal of a command, or of a frame with that counter."""
         self.refused[result.name.lower()] += 1
+        if isinstance(what, DeviceRequest) and what.kind is DeviceKind.NOTE:
+            return  # a refusal by DeviceState is that of a join
         if self._refusal_limit.count_tokens(self._now()) >= 1.0:
             # Limited, so that a flood of invalid frames does not cause a flood of replies.
             self._refusal_limit.remove_token()

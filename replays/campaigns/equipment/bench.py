@@ -137,6 +137,10 @@ class Bench(Closing):
         self._late = self._late_before = 0
         self.can_url: str | None = None
         """Address of the rig on a CAN bus, for `rig.connect` and `Daq.open`; None without a bus."""
+        self.socketcand_url: str | None = None
+        """HOST:PORT at which the bus is served by socketcand, under the name can0; None without a bus."""
+        self.slcan_path: str | None = None
+        """Path of a pseudo-terminal that acts as an SLCAN adapter on the bus; None without a bus."""
         if target.url is not None:
             self.url = target.url
         else:
@@ -147,6 +151,8 @@ class Bench(Closing):
                 self._program.end()
                 raise BenchError(f"the rig did not start: {last_line}")
             self.url = f"zenoh:{line.partition('listening on ')[2].split()[0].rstrip(';')}"
+            if settings.can and (line := self._program.wait_for(_SLCAN, START_S)) is not None:
+                self.slcan_path = line.partition(_SLCAN)[2]
         try:
             self._console = self.connect(name="campaign", channels=())
             self.pace: str = self._console.pace
@@ -164,7 +170,8 @@ class Bench(Closing):
         if settings.can:
             bus = f"zenoh:can0?endpoint=127.0.0.1:{free_port()}"
             self.can_url = f"can:{bus}"
-            listen += ["--can", bus]
+            self.socketcand_url = f"127.0.0.1:{free_port()}"
+            listen += ["--can", bus, "--can-socketcand", self.socketcand_url, "--can-slcan"]
         changes = dict(settings.set)
         if settings.duration_s is not None or settings.pace == "real-time":
             changes["duration_s"] = settings.duration_s or _LIVE_S
@@ -369,6 +376,8 @@ class Bench(Closing):
 
 
 DEFAULT_SCENE = "stable-run"
+_SLCAN = "SLCAN adapter on "
+"""Words of the rig before the path of its pseudo-terminal."""
 _NUMBERS = itertools.count(1)
 _MAX_MISSING_S = 0.01
 """Longest part of a run that a recording may lack, as it ends at its last sample [s]."""

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from replays.campaigns.equipment.bench import Bench, BenchError
 from replays.campaigns.equipment.process import Program
-from rig.base.errors import InputError
+from replays.campaigns.measurement import split_quantity
+from rig.base import units
+from rig.base.errors import InputError, such_as
 from rig.serve.waiting import Deadline
 
+PLACEHOLDER = re.compile(r"\{\{|\}\}|\{(\w+)(?::([^{}]*))?\}|[{}]")
+"""A placeholder, an escaped brace, or a single brace."""
 _LINK_S = 10.0
 """Longest wait for a device's connection [s]."""
-PLACES = ("url", "can", "name", "folder")
+PLACES = ("url", "can", "socketcand", "slcan", "name", "folder")
 """Placeholders of a command line that are filled in at the start."""
+CAN_PLACES = ("can", "socketcand", "slcan")
+"""Placeholders that need a CAN bus."""
 
 
 class Device:
@@ -24,7 +31,8 @@ class Device:
 
     Args:
         command: Command line. Placeholders: `{url}` (address of the rig), `{can}` (its address on the CAN bus),
-            `{name}` (name of the device) and `{folder}` (folder for its files).
+            `{socketcand}` (HOST:PORT of its socketcand server), `{slcan}` (path of its SLCAN adapter), `{name}` (name
+            of the device) and `{folder}` (folder for its files).
         name: Name of the device.
         bench: Bench that it is tested on.
         log: File for its output.
@@ -38,12 +46,14 @@ class Device:
     def __init__(
         self, command: str | Sequence[str], *, name: str, bench: Bench, log: Path, where: Path, files: Path
     ) -> None:
-        places = {"url": bench.url, "can": bench.can_url or "", "name": name, "folder": str(files)}
+        given = (bench.url, bench.can_url, bench.socketcand_url, bench.slcan_path, name, str(files))
+        places = {place: text for place, text in zip(PLACES, given, strict=True) if text is not None}
         words = shlex.split(command) if isinstance(command, str) else list(map(str, command))
-        for place in places:
-            words = [word.replace(f"{{{place}}}", places[place]) for word in words]
+        words = [fill_placeholders(word, places, "command") for word in words]
         check_program(words, where, field="command")
         self.name, self.log, self._bench = name, log, bench
+        self.joins = True
+        """Whether the rig waits for it in lockstep."""
         self.rig_name = name
         """The rig's name for the device; a number on CAN."""
         self._others = bench.joined
@@ -81,6 +91,39 @@ class Device:
         """
         if (status := self.program.status) is not None:
             raise BenchError(f"device {self.name} ended with status {status}: {self.program.last_line}")
+
+
+def fill_placeholders(text: str, places: Mapping[str, str], field: str, kept: Sequence[str] = ()) -> str:
+    """Fill in the placeholders of a text: `{danger}`, or `{danger:um}` as a number in um without its unit.
+
+    `{{` and `}}` are braces of the text. If placeholders are kept, so are these, and the result can be filled again.
+
+    Raises:
+        InputError: If a brace or a placeholder is invalid.
+    """
+
+    def fill(match: re.Match[str]) -> str:
+        name, unit = match[1], match[2]
+        if name is None:
+            if len(match[0]) == 2:
+                return match[0] if kept else match[0][0]
+            must = f"a text with {', '.join(f'{{{place}}}' for place in (*places, *kept)) or 'no placeholder'}, "
+            raise InputError(field, f"{must}and {{{{ or }}}} for a brace", text)
+        if name in kept:
+            return match[0]
+        if name not in places:
+            raise InputError(field, such_as("a text with known names in braces", name, [*places, *kept]), match[0])
+        found = places[name] if unit is None else _convert(name, places[name], unit, match[0], field)
+        return found.replace("{", "{{").replace("}", "}}") if kept else found
+
+    return PLACEHOLDER.sub(fill, text)
+
+
+def _convert(name: str, text: str, unit: str, placeholder: str, field: str) -> str:
+    number, own = split_quantity(text, field=field)
+    if units.get_quantity(own) != units.get_quantity(unit) or not units.get_quantity(unit):
+        raise InputError(field, f"with {name} in a unit of {units.get_quantity(own) or own}", placeholder)
+    return f"{number * units.size_si(own) / units.size_si(unit):.12g}"
 
 
 def check_program(words: Sequence[str], where: Path, *, field: str) -> None:

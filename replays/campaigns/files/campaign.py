@@ -16,14 +16,13 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat
 
 from replays.campaigns.equipment.bench import BenchSettings, Pace
-from replays.campaigns.equipment.device import PLACES, check_program
+from replays.campaigns.equipment.device import CAN_PLACES, PLACEHOLDER, PLACES, check_program, fill_placeholders
 from replays.campaigns.files.case_results import Time, Units
-from replays.campaigns.files.expectation import KINDS, Expect
+from replays.campaigns.files.expectation import KINDS, Expect, find_events
 from replays.campaigns.files.line_numbers import find_line, number_lines
 from replays.campaigns.measurement import split_quantity
-from rig.base import units
 from rig.base.checks import Written, build_read_error, check, open_file, parse_toml
-from rig.base.errors import InputError, UnknownNameError, Words, such_as
+from rig.base.errors import InputError, UnknownNameError, Words
 from rig.channels.faults import find_channels, find_group
 from rig.channels.faults.blocks import OfBlocks
 from rig.physics.kernels import signals
@@ -33,7 +32,6 @@ from rig.run.scenes import Scene, load_scene
 SUFFIX = ".campaign.toml"
 FOLDER = Path(__file__).parents[1]
 """Folder of the shipped campaigns."""
-_PLACEHOLDER = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 _MAX_CASES = 10_000
 _BLOCK_MS = (1.0, 1000.0)
 Line = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -84,6 +82,7 @@ class _File(Written):
     channels: str = ""
     can: bool = False
     device: _Device | None = None
+    devices: list[_Device] = Field(default=[])
     limits: dict[str, Quantity] = Field(default={})
     matrix: _Matrix = _Matrix()
     steps: list[dict[str, Any]] = Field(default=[])
@@ -117,7 +116,7 @@ class Case:
         bench: Settings of the bench.
         duration_s: Length of the case [s].
         steps: Steps in order of time.
-        device: Device under test; None runs the rig alone.
+        devices: Devices under test, in the order of their start; without one the rig runs alone.
         expects: Expectations.
         axes: Values on the axes of the matrix, by axis.
     """
@@ -128,7 +127,7 @@ class Case:
     bench: BenchSettings
     duration_s: float
     steps: tuple[Step, ...]
-    device: _Device | None
+    devices: tuple[_Device, ...]
     expects: tuple[Expect, ...]
     axes: Mapping[str, str]
 
@@ -198,7 +197,7 @@ def load_campaign(path: Path, device: str | None = None, limits: Sequence[str] =
         file = check(_File, document, field="")
         if device is not None:
             if file.device is None:
-                raise InputError("--device", "left out, as the campaign has no device", device)
+                raise InputError("--device", "left out, as the campaign has no [device]", device)
             own = file.device.model_copy(update={"command": device, "folder": str(Path.cwd())})
             file = file.model_copy(update={"device": own})
         cases = tuple(_cases(path, _replace_limits(file, limits)))
@@ -309,20 +308,22 @@ def _case(
         load_scene(scene_name, {**changes, **({"channels": table} if table else {}), "commands": [*own, *timed]})
     known: Units = {"": {key: each.unit for key, each in scene.table.channels.items()}, **_TRUTH}
     axes = {axis.rpartition(" ")[2]: [label for label, _ in each] for axis, each in _axes(file)}
+    devices = tuple(_devices(file, places, path))
+    sources = {"note" if step.command is None else "command" for step in steps} | {"command" for _ in own}
     expects = []
     for n, one in enumerate(file.expect):
         expect = _expect(one, f"expect.{n}", places, known, duration_s)
         _check_when(expect, f"expect.{n}.when", axes)
+        _check_pace(expect, f"expect.{n}", devices if file.pace == "lockstep" else (), sources)
         if all(named[axis] in labels for axis, labels in _when(expect)):
             expects.append(expect)
     if not expects:
         raise InputError("expect", "with something for each case", Words(f"nothing for {name}"))
-    device = None if file.device is None else _device(file, places, path)
     bench = BenchSettings(
         scene=scene_name, pace=file.pace, block_ms=file.block_ms, set=changes, table=table, can=file.can
     )
     ordered = tuple(sorted(steps, key=lambda step: step.at_s))
-    return Case(name, file.title, path, bench, duration_s, ordered, device, tuple(expects), named)
+    return Case(name, file.title, path, bench, duration_s, ordered, devices, tuple(expects), named)
 
 
 _TRUTH: Units = {
@@ -362,29 +363,12 @@ def _field(name: str) -> Iterator[None]:
 
 
 def _fill_placeholders(value: Any, places: Mapping[str, str], field: str, kept: tuple[str, ...] = ()) -> Any:
-    """Fill in the placeholders of a value: `{danger}`, or `{danger:um}` as a number in um without its unit."""
+    """Fill in the placeholders of all texts of a value."""
     if isinstance(value, dict):
         return {key: _fill_placeholders(each, places, f"{field}.{key}", kept) for key, each in value.items()}
     if isinstance(value, list):
         return [_fill_placeholders(each, places, f"{field}.{n}", kept) for n, each in enumerate(value)]
-    if not isinstance(value, str):
-        return value
-
-    def fill(match: re.Match[str]) -> str:
-        name, unit = match[1], match[2]
-        if name in kept:
-            return match[0]
-        if name not in places:
-            must = "a text with names of [limits] or [matrix.device] between braces"
-            raise InputError(field, such_as(must, name, [*places, *kept]), match[0])
-        if unit is None:
-            return places[name]
-        number, own = split_quantity(places[name], field=field)
-        if units.get_quantity(own) != units.get_quantity(unit) or not units.get_quantity(unit):
-            raise InputError(field, f"with {name} in a unit of {units.get_quantity(own) or own}", match[0])
-        return f"{number * units.size_si(own) / units.size_si(unit):.12g}"
-
-    return _PLACEHOLDER.sub(fill, value)
+    return fill_placeholders(value, places, field, kept) if isinstance(value, str) else value
 
 
 def _step(
@@ -392,7 +376,7 @@ def _step(
 ) -> Step:  # fmt: skip
     one = _fill_placeholders(dict(given), places, field)
     for key, text in given.items():
-        if isinstance(text, str) and (match := _PLACEHOLDER.fullmatch(text)) and match[2]:
+        if isinstance(text, str) and (match := PLACEHOLDER.fullmatch(text)) and match[2]:
             one[key] = float(one[key])  # a number in a unit
     if "note" in one:
         note = check(_Note, one, field=field)
@@ -474,17 +458,48 @@ def _check_when(expect: Expect, field: str, axes: Mapping[str, list[str]]) -> No
                 raise UnknownNameError(f"{field}.{axis}", f"a value of {axis} in the matrix", label, axes[axis])
 
 
-def _device(file: _File, places: Mapping[str, str], path: Path) -> _Device:
-    assert file.device is not None
-    command = _fill_placeholders(file.device.command, places, "device.command", PLACES)
-    if "{can}" in command and not file.can:
-        raise InputError("device.command", "without {can} unless can = true", command)
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise InputError("device.command", "a command line", Words(f"{command} ({error})")) from None
-    folder = path.parent / file.device.folder
-    if not folder.is_dir():
-        raise InputError("device.folder", "a folder", file.device.folder)
-    check_program(words, folder, field="device.command")
-    return _Device(**{**file.device.model_dump(), "command": command})
+def _check_pace(expect: Expect, field: str, devices: tuple[_Device, ...], sources: set[str]) -> None:
+    """Check that an expectation in lockstep is not about events of a device for which the rig does not wait.
+
+    An event without `from` is that of such a device if all devices are such ones, and the case has no step that may be
+    its source.
+    """
+    outside = [device.name for device in devices if not device.joins]
+    sends = any(device.commands for device in devices if not device.joins)
+    known = {"campaign", *(device.name for device in devices if device.joins)}
+    for event in find_events(expect) if outside else ():
+        sender = event.where.get("from")
+        is_device_event = event.event in ("note", "command", *COMMANDS)
+        is_from_step = ("note" if event.event == "note" else "command") in sources
+        only_outside = sends and len(known) == 1 and is_device_event and not (sender is None and is_from_step)
+        if sender in outside or (only_outside and sender not in known):
+            must = (
+                f"about events whose time is exact, not of {' or '.join(outside)}: the rig does not wait for it in "
+                'lockstep (use joins = true, or pace = "real-time")'
+            )
+            raise InputError(field, must, str(event))
+
+
+def _devices(file: _File, places: Mapping[str, str], path: Path) -> Iterator[_Device]:
+    if file.device is not None and file.devices:
+        raise InputError("devices", "left out with [device]", len(file.devices))
+    several = {f"devices.{n}": device for n, device in enumerate(file.devices)}
+    names = {"rig"}  # the log of the rig is rig.log
+    for field, device in (several if file.device is None else {"device": file.device}).items():
+        if device.name in names:
+            raise InputError(f"{field}.name", "another name than rig and those of other devices", device.name)
+        names.add(device.name)
+        folder = path.parent / device.folder
+        if not folder.is_dir():
+            raise InputError(f"{field}.folder", "a folder", device.folder)
+        field = f"{field}.command"
+        command = _fill_placeholders(device.command, places, field, PLACES)
+        for place in CAN_PLACES:
+            if not file.can and f"{{{place}}}" in command.replace("{{", ""):
+                raise InputError(field, f"without {{{place}}} unless can = true", command)
+        try:
+            words = shlex.split(command)
+        except ValueError as error:
+            raise InputError(field, "a command line", Words(f"{command} ({error})")) from None
+        check_program(words, folder, field=field)
+        yield _Device(**{**device.model_dump(), "command": command})

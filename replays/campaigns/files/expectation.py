@@ -349,5 +349,14 @@ def _list_times(times_s: list[float]) -> str:
     return f"{', '.join(f'{each:g}' for each in times_s[:5])}{', ...' if len(times_s) > 5 else ''} s"
 
 
+def find_events(expect: Expect) -> Iterator[EventOf]:
+    """Yield all events of an expectation: expected, not expected, and the origin of a time."""
+    since = None if isinstance(expect, ExpectOrder | ExpectScore) else expect.since
+    yield from expect.order if isinstance(expect, ExpectOrder) else ()
+    yield from [expect.of] if isinstance(expect, ExpectEvent) else ()
+    if since is not None and since.event:
+        yield EventOf(event=since.event, where=since.where, text=since.text)
+
+
 def _name(names: tuple[str, ...]) -> str:
     return names[0] if len(names) == 1 else f"the orbit of {' and '.join(names)}"

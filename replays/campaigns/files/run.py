@@ -48,15 +48,14 @@ def run_case(case: Case, trial: Trial) -> None:
     else:
         settings = replace(settings, commands=timed, duration_s=case.duration_s)
     bench = trial.start_bench(settings)
-    if case.device is not None and trial.target.replay is not None and case.device.commands:
-        raise UnsupportedError(f"a recording takes no commands of {case.device.name}")
+    for each in case.devices if trial.target.replay is not None else ():
+        if each.commands:
+            raise UnsupportedError(f"a recording takes no commands of {each.name}")
     record = trial.start_record()
     record.wait_until_connected()
-    device: Device | None = None
-    if case.device is not None:
-        joins = None if case.device.joins else False
-        where = case.file.parent / case.device.folder
-        device = trial.start_device(case.device.command, name=case.device.name, where=where, joins=joins)
+    for each in case.devices:
+        joins, where = None if each.joins else False, case.file.parent / each.folder
+        trial.start_device(each.command, name=each.name, where=where, joins=joins)
     trial.origin_s = bench.begin()
     with bench.connect(name="campaign", channels=()) as machine:
         for step in live:
@@ -68,7 +67,7 @@ def run_case(case: Case, trial: Trial) -> None:
             _stop(machine)
             record.wait()
     trial.recording = record.stop()
-    if device is not None:
+    for device in trial.devices:
         end_device(device, trial)
     seen = CaseRecording(trial.recording, trial.folder, trial.origin_s)
     _measure_device(seen, trial)
@@ -77,7 +76,7 @@ def run_case(case: Case, trial: Trial) -> None:
         for measurement in expect.measure(seen, seen.units):
             exact = measurement.resolution
             # Times that depend on the device have the resolution of its reaction.
-            resolution = f"{exact}; {trial.resolution}" if exact and case.device is not None else exact
+            resolution = f"{exact}; {trial.resolution}" if exact and case.devices else exact
             trial.take(replace(measurement, resolution=resolution))
 
 
