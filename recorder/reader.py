@@ -165,9 +165,9 @@ class Recording:
         return dict(sorted(streams.items()))
 
     @property
-    def short(self) -> tuple[str, ...]:
+    def missing_rows(self) -> tuple[str, ...]:
         """Rows that the files state and do not contain, one line per stream."""
-        return self._collect_remarks(lambda survey: survey.short)
+        return self._collect_remarks(lambda survey: survey.missing_rows)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -175,7 +175,7 @@ class Recording:
         return self._collect_remarks(lambda survey: survey.doubts)
 
     def scan(self, on_block: OnBlock | None = None) -> None:
-        """Scan all files; `streams`, `short` and `doubts` then need no further pass.
+        """Scan all files; `streams`, `missing_rows` and `doubts` then need no further pass.
 
         Args:
             on_block: Callback for each block that fits the catalogue, in file order.
@@ -297,7 +297,8 @@ class Recording:
     def between(self, from_s: float, to_s: float) -> Self:
         """Return the recording limited to the rows between two times [s]; see `RecordingFile.between`.
 
-        Its `streams` cover only the rows near these times; `short` and `doubts` are empty, as the rest is not read.
+        Its `streams` cover only the rows near these times; `missing_rows` and `doubts` are empty, as the rest is not
+        read.
         """
         if math.isinf(from_s) and math.isinf(to_s):
             return self

@@ -46,14 +46,14 @@ class Rewritten:
         counts: Totals of the new file.
         damaged: Number of damaged records of the source that were skipped.
         unchecked: Data of the source without a checksum.
-        short: Losses of the source by its own counts, as lines of text.
+        missing_rows: Losses of the source by its own counts, as lines of text.
     """
 
     path: Path
     counts: Counts
     damaged: int
     unchecked: tuple[str, ...] = ()
-    short: tuple[str, ...] = ()
+    missing_rows: tuple[str, ...] = ()
 
 
 def recovered_path(source: Path) -> Path:
@@ -81,7 +81,7 @@ def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None
                 return False
             step = _progress(recording, on_progress)
             recording.scan(lambda key, block: step())
-            return not recording.short
+            return not recording.missing_rows
         except InputError:
             return False
 
@@ -115,7 +115,7 @@ def recover(
             "source_bytes": str(source.stat().st_size),
             "damaged_records": str(recording.damaged),
             "unchecked": "; ".join(recording.unchecked),
-            "short": "; ".join(recording.short),
+            "short": "; ".join(recording.missing_rows),
         }
         lost = InputError("file", "a recording with readable rows", Words(f"{source}, which has none"))
         due, ends = _lost_ends(recording)
@@ -127,10 +127,10 @@ def recover(
             force=force,
             due=due,
             ends=ends,
-            empty=lost if recording.damaged or recording.short else None,
+            empty=lost if recording.damaged or recording.missing_rows else None,
             on_progress=on_progress,
         )
-    return Rewritten(output, counts, recording.damaged, recording.unchecked, recording.short)
+    return Rewritten(output, counts, recording.damaged, recording.unchecked, recording.missing_rows)
 
 
 def _lost_ends(recording: Recording) -> tuple[dict[str, int], dict[str, int]]:
@@ -243,7 +243,7 @@ def cut(
         empty=InputError("from and to", must, Words(f"{from_s:g} to {to_s:g} s")),
         on_progress=on_progress,
     )
-    return Rewritten(output, counts, recording.damaged, short=recording.short)
+    return Rewritten(output, counts, recording.damaged, missing_rows=recording.missing_rows)
 
 
 def _write(

@@ -70,17 +70,17 @@ _INVERSE_OPERATORS = {
 _DISPLAY_FUNCTIONS = ("__repr__", "__str__", "picture", "verdict_line", "describe")
 """Functions whose places are skipped: their results are only displayed."""
 PICKED_MUTANTS = (
-    ("replays/score/card/scorecard.py", "=PASS in verdicts and not self.doubts", "=not self.doubts"),
-    ("replays/score/card/scorecard.py", "=PASS in verdicts and not self.doubts", "=PASS in verdicts"),
+    ("replays/score/card/scorecard.py", "=PASS in verdicts and not self.evidence_gaps", "=not self.evidence_gaps"),
+    ("replays/score/card/scorecard.py", "=PASS in verdicts and not self.evidence_gaps", "=PASS in verdicts"),
     ("replays/score/card/scorecard.py", "limit.low <= low and high <= limit.high", "limit.low <= value <= limit.high"),
     ("replays/score/card/scorecard.py", "high < limit.low or low > limit.high", "low < limit.low or high > limit.high"),
-    ("replays/estimate/intervals.py", "student_quantile(0.975, freedom)", "student_quantile(0.95, freedom)"),
-    ("replays/estimate/intervals.py", "chi2_quantile(0.025, freedom)", "chi2_quantile(0.05, freedom)"),
+    ("replays/estimate/intervals.py", "student_quantile(0.975, dof)", "student_quantile(0.95, dof)"),
+    ("replays/estimate/intervals.py", "chi2_quantile(0.025, dof)", "chi2_quantile(0.05, dof)"),
     ("replays/estimate/spectra.py", "np.hanning(rows + 1)[:-1]", "np.hanning(rows)"),
     ("replays/score/alignment/stamps.py", "jitter_s / math.sqrt(low)", "jitter_s / math.sqrt(high)"),
     (
         "replays/score/waveform.py",
-        "student(self.freedom) * self.spread", "0.84 * student(self.freedom) * self.spread",
+        "student(self.dof) * self.spread", "0.84 * student(self.dof) * self.spread",
     ),
     ("replays/score/card/limits.py", "if any(map(math.isnan, ends)):", "if False:"),
     ("replays/score/card/limits.py", "channel.lsb_v / math.sqrt(12.0))\n", "channel.lsb_v)\n"),

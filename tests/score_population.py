@@ -85,7 +85,7 @@ class Population:
 def _by_function(case: Case) -> dict[str, Any]:
     card = judge(case.file, [case.sent.path], path=case.path, **case.judged)
     red = [(row.quantity, row.channel) for row in card.rows if row.verdict == FAIL]
-    reason = "; ".join(card.doubts or card.remarks)[:300]
+    reason = "; ".join(card.evidence_gaps or card.remarks)[:300]
     return {"outcome": str(card.outcome), "path": card.path, "red": red, "reason": reason, "line": card.verdict_line}
 
 

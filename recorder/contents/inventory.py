@@ -127,7 +127,7 @@ class Survey:
         self._end()
 
     @cached_property
-    def short(self) -> tuple[str, ...]:
+    def missing_rows(self) -> tuple[str, ...]:
         """Rows that the file states and does not contain, one line per stream."""
         return tuple(
             f"{stream.missing} rows of {key} are missing" for key, stream in self.streams.items() if stream.missing
@@ -137,7 +137,7 @@ class Survey:
     def doubts(self) -> tuple[str, ...]:
         """Contradictions in a file whose checksums are all valid, one line each."""
         formats, messages = self.file.formats, self.file.messages
-        found = list(self.short)
+        found = list(self.missing_rows)
         for key, stream in self.streams.items():
             if stream.invalid:
                 found.append(f"payloads of {key} that are not blocks or do not fit the catalogue: {stream.invalid}")

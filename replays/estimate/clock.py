@@ -37,7 +37,7 @@ class Line(NamedTuple):
         return float(self.offset - self.slope * self.centre)
 
     @property
-    def half(self) -> tuple[float, float]:
+    def half_widths(self) -> tuple[float, float]:
         """Half widths of the 95 % intervals of the slope and of the value at x = 0, for independent residuals."""
         n = len(self.residual)
         variance = float(self.residual @ self.residual) / (n - 2)

@@ -64,8 +64,8 @@ def refine(matrix: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.nda
         return np.zeros(k), residual, *sandwich(matrix, residual)
     both = np.column_stack([matrix, slow])
     change = solve(both, residual)
-    covariance, freedom = sandwich(both, residual - both @ change)
-    return change[:k], residual - matrix @ change[:k], covariance[:k, :k], freedom[:k]
+    covariance, dof = sandwich(both, residual - both @ change)
+    return change[:k], residual - matrix @ change[:k], covariance[:k, :k], dof[:k]
 
 
 def sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -103,37 +103,37 @@ def sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) ->
     apart[:, np.arange(_BLOCKS), np.arange(_BLOCKS)] += np.einsum("kbi,bij,kj->kb", lifted, lift, white)
     apart *= np.outer(noise, noise) / max(float(noise @ noise), 1e-300)
     squares = np.sum(apart**2, axis=(1, 2))
-    freedom = np.trace(apart, axis1=1, axis2=2) ** 2 / np.maximum(squares, 1e-300)
+    dof = np.trace(apart, axis1=1, axis2=2) ** 2 / np.maximum(squares, 1e-300)
     covariance = contributions.T @ contributions
     # First-order correlation between blocks, minus its standard deviation for uncorrelated noise.
     correlation = np.sum(contributions[1:] * contributions[:-1], axis=0) / np.maximum(np.diag(covariance), 1e-300)
     correlation = np.clip(correlation - _BLOCKS**-0.5, 0.0, _MAX_CORRELATION)
     growth = (1.0 + correlation) / (1.0 - correlation)
-    return covariance * np.sqrt(np.outer(growth, growth)) / np.outer(sizes, sizes), np.maximum(1.0, freedom / growth)
+    return covariance * np.sqrt(np.outer(growth, growth)) / np.outer(sizes, sizes), np.maximum(1.0, dof / growth)
 
 
-def student(freedom: ArrayLike) -> Any:
+def student(dof: ArrayLike) -> Any:
     """Return the 97.5 % quantile of Student's t for each number of degrees of freedom."""
-    return student_quantile(0.975, freedom)
+    return student_quantile(0.975, dof)
 
 
-def student_quantile(probability: float, freedom: ArrayLike) -> Any:
+def student_quantile(probability: float, dof: ArrayLike) -> Any:
     """Return a quantile of Student's t for each number of degrees of freedom."""
     from scipy.stats import t
 
-    return t.ppf(probability, freedom)
+    return t.ppf(probability, dof)
 
 
-def chi2_quantile(probability: float, freedom: float) -> float:
+def chi2_quantile(probability: float, dof: float) -> float:
     """Return a quantile of chi squared."""
     from scipy.stats import chi2
 
-    return float(chi2.ppf(probability, freedom))
+    return float(chi2.ppf(probability, dof))
 
 
-def chi2_mean_ends(freedom: float) -> tuple[float, float]:
+def chi2_mean_ends(dof: float) -> tuple[float, float]:
     """Return the 95 % interval of a mean of squares, relative to its expectation."""
-    return chi2_quantile(0.025, freedom) / freedom, chi2_quantile(0.975, freedom) / freedom
+    return chi2_quantile(0.025, dof) / dof, chi2_quantile(0.975, dof) / dof
 
 
 def jackknife(steps: np.ndarray) -> np.ndarray:
@@ -169,15 +169,15 @@ def draw_normal(covariance: np.ndarray, generator: np.random.Generator, draws: i
     return size * (white * np.sqrt(np.maximum(powers, 0.0)) @ directions.T)
 
 
-def bound_maximum(values: np.ndarray, spread: np.ndarray, freedom: ArrayLike = math.inf) -> tuple[float, float, float]:
+def bound_maximum(values: np.ndarray, spread: np.ndarray, dof: ArrayLike = math.inf) -> tuple[float, float, float]:
     """Return the largest of several estimates with a simultaneous 95 % interval (Bonferroni): value, low, high.
 
     Args:
         values: Estimates, shape (n,).
         spread: Standard deviations, shape (n,).
-        freedom: Degrees of freedom of the standard deviations.
+        dof: Degrees of freedom of the standard deviations.
     """
-    half = student_quantile(1.0 - 0.025 / len(values), freedom) * spread
+    half = student_quantile(1.0 - 0.025 / len(values), dof) * spread
     return float(values.max()), float((values - half).max()), float((values + half).max())
 
 

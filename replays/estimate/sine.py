@@ -136,8 +136,8 @@ def quality(fit: SineFit) -> Quality:
     floor = _noise_floor(fit.residual)
     # The power of a noise line has its own value as spread; a distinct line adds twice its product with the noise.
     spread = max(float(floor @ (2.0 * lines - floor)), 0.5 * float(floor @ floor))
-    freedom = (1.0 - 4.0 / n) * 2.0 * float(lines.sum()) ** 2 / spread
-    ends = [10.0 * math.log10(end) for end in chi2_mean_ends(freedom)]
+    dof = (1.0 - 4.0 / n) * 2.0 * float(lines.sum()) ** 2 / spread
+    ends = [10.0 * math.log10(end) for end in chi2_mean_ends(dof)]
     sinad = (ratio, ratio + ends[0], ratio + ends[1])
     enob = ((sinad[0] - 1.76) / 6.02, (sinad[1] - 1.76) / 6.02, (sinad[2] - 1.76) / 6.02)
     distortion, variance = 0.0, 0.0

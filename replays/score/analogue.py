@@ -12,7 +12,7 @@ from replays.estimate.intervals import make_interval, pool_estimates, sandwich, 
 from replays.estimate.least_squares import solve
 from replays.estimate.sine import fit_sine, is_sine, quality
 from replays.score.alignment.alignment import align
-from replays.score.alignment.one_begin import Alignment, RowSource
+from replays.score.alignment.single_start import Alignment, RowSource
 from replays.score.alignment.stamps import Stamps
 from replays.score.card.scorecard import (
     ANALOGUE,
@@ -224,10 +224,10 @@ def _fit_alias(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray
     """
     matrix = np.column_stack([*above, found.known, found.slope, np.ones(len(found.known))])
     parts = solve(matrix, found.residual)
-    covariance, freedom = sandwich(matrix, found.residual - matrix @ parts)
+    covariance, dof = sandwich(matrix, found.residual - matrix @ parts)
     amount = max(float(np.linalg.norm(parts[:2])), 1e-300)
     way = parts[:2] / amount
-    half = float(student(freedom[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
+    half = float(student(dof[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
     return matrix @ parts, (amount, max(0.0, amount - half), amount + half)
 
 
@@ -262,7 +262,7 @@ def score_analogue(
 def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[str, Recorded]) -> None:
     """Add lost and doubled samples, and the judged part of each table."""
     if not alignments:
-        card.doubts.append("no channel is found in the session")
+        card.evidence_gaps.append("no channel is found in the session")
         for quantity in ("lost samples", "doubled samples", "judged part"):
             card.add(quantity, "", None)
     for alignment in alignments:
@@ -335,11 +335,11 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
         return
     reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else found[0]
     low = reference.low
-    halves = np.maximum([one.low.half[3] for one in found], 1e-15)
+    halves = np.maximum([one.low.half_widths[3] for one in found], 1e-15)
     drifts = np.array([one.low.drift for one in found])
     middle = np.sort(drifts)[(len(found) - 1) // 2] if len(found) > 2 else low.drift
     own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * halves, _OWN_CLOCK[1])
-    bend_halves = np.maximum([one.low.half[4] for one in found], 1e-15)
+    bend_halves = np.maximum([one.low.half_widths[4] for one in found], 1e-15)
     bends = np.array([one.low.bend for one in found])
     for quantity, values, half, others in (("clock", drifts, halves, own), ("clock drift", bends, bend_halves, own)):
         weights = np.where(others, 0.0, half**-2.0)
@@ -355,14 +355,14 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
     # To time zero of the file, by its own clock.
     back = np.array([0.0, 0.0, 1.0, -low.middle_s, 0.5 * low.middle_s**2 - low.half_s**2 / 6.0])
     spread = math.sqrt(back @ low.covariance @ back)
-    start = make_interval(float(low.late_at(np.zeros(1))[0]), float(student(low.freedom[2:].min())) * spread)
+    start = make_interval(float(low.late_at(np.zeros(1))[0]), float(student(low.dof[2:].min())) * spread)
     card.add("start", reference.name, start, of=reference.channel, note=note)
     if open_:
         card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["start"].run)
     for one in found:
         if one is not reference:
             apart = late_s(one) - late_s(reference)
-            both = math.hypot(one.low.half[2], low.half[2])
+            both = math.hypot(one.low.half_widths[2], low.half_widths[2])
             odd = _FILTER if one.odd or reference.odd else ""
             filtered = "" if _has_same_corner(one, reference) else _OTHER_CORNER
             said = "; ".join(each for each in (f"against {reference.name}", note, odd or filtered) if each)
@@ -395,9 +395,9 @@ def _score_wires(
     # A start half a period later inverts all channels of a table, not their biases: one known sign fixes the others.
     fixed = {
         name for each in alignments for name in each.names
-        if any(not wires[n].turned or _is_biased(recorded[n], fits[n].channel) for n in each.names if n in fits)
+        if any(not wires[n].ambiguous or _is_biased(recorded[n], fits[n].channel) for n in each.names if n in fits)
     }  # fmt: skip
-    open_ = {name for name in fits if name in ambiguous and wires[name].turned and name not in fixed}
+    open_ = {name for name in fits if name in ambiguous and wires[name].ambiguous and name not in fixed}
     mixed = len({signs[name] for name in open_}) > 1
     if open_ and not mixed:
         card.remarks.append(f"the polarity of {', '.join(sorted(open_))} is open: it is inverted half a period later")
@@ -437,8 +437,9 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
         card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
     note = _FILTER if one.odd else "" if one.good else f"the signal explains {max(0.0, one.clean.likeness):.1%} of it"
-    add("gain", None if note else make_interval(abs(low.gain) - 1.0, low.half[0], 1e6), note or one.rounding_note)
-    add("offset", make_interval(low.offset, low.half[1]) if one.good else None, one.rounding_note)
+    gain = None if note else make_interval(abs(low.gain) - 1.0, low.half_widths[0], 1e6)
+    add("gain", gain, note or one.rounding_note)
+    add("offset", make_interval(low.offset, low.half_widths[1]) if one.good else None, one.rounding_note)
     # It is unknown whether the rig's own noise, which is in its samples, was in the DAQ's input.
     split = split_noise(one.clean, floor=one.known_noise, steps=bool(one.rounding))
     noise = split.noise if one.good else split.left
@@ -450,7 +451,7 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
     ranges = [20.0 * math.log10(full / max(noise[n], 1e-12 * full) / math.sqrt(2.0)) for n in (0, 2, 1)]
     add("effective bits", (bits[0], bits[1], bits[2]))
     add("dynamic range", (ranges[0], ranges[1], ranges[2]))
-    limit = card.asked(card.path, "corner", channel)
+    limit = card.find_limit(card.path, "corner", channel)
     estimate, note = one.corner_hz, ""
     if estimate is None and one.shown is not None:
         highest = float(one.shown.frequency_hz[-1])

@@ -13,7 +13,7 @@ from itertools import chain
 import numpy as np
 
 from replays.score.alignment.overlap import holds_session_rows
-from replays.score.alignment.placing import SignalRows
+from replays.score.alignment.row_matching import SignalRows
 from replays.score.alignment.stamps import Stamps
 from replays.score.card.scorecard import Interval, Scorecard
 from replays.score.records.live import Arrivals
@@ -26,7 +26,7 @@ from rig.channels.table import Channel
 
 _BACKLOG_S = 1.0
 """Initial time for which no latency is measured, because rows that waited in a pipe arrive then [s]."""
-_NAMES = 5
+_MAX_RANGES = 5
 """Largest number of row ranges in a note; the JSON document has all."""
 _REPEATING_PART = 0.5
 """Fraction of repeated rows above which the loss of whole periods may go unnoticed."""
@@ -95,7 +95,7 @@ def _score_rows(
             found = {name: by_name[name].counts(values) for name, values in columns}
             yield np.column_stack([found[name] for name in names])
 
-    def adapt(sent: Sent) -> Iterator[np.ndarray]:
+    def convert(sent: Sent) -> Iterator[np.ndarray]:
         """Yield the counts that a DAQ with these converters records of those sent."""
         for chunk in sent:
             cut = chunk[:, columns] >> bits << bits
@@ -106,7 +106,7 @@ def _score_rows(
     bits = np.array([recorded[name].lost_bits for name in names])
     coarse = any(scale.rounding for scale in by_name.values())
     found, trigger, at, repeats = Followed(), None, one.early, list[float]()
-    for places, found in follow(adapt(sent), counts(one.early), sound, one.start):  # noqa: B007
+    for places, found in follow(convert(sent), counts(one.early), sound, one.start):  # noqa: B007
         known = np.flatnonzero(places >= 0)
         since_s = sent.since_s(places[known]) if len(known) else np.empty(0)
         stamps.add_rows(sent.first_s, since_s, known, len(places))
@@ -128,19 +128,19 @@ def _score_rows(
         if len(runs):
             ranges = [(a, b) for a, b in (sent.numbers(runs) if numbered else runs).tolist()]
             card.runs[f"{quantity} {channel}"] = ranges
-            note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in ranges[:_NAMES])
-            note += f" and {len(ranges) - _NAMES} more stretches" if len(ranges) > _NAMES else ""
+            note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in ranges[:_MAX_RANGES])
+            note += f" and {len(ranges) - _MAX_RANGES} more stretches" if len(ranges) > _MAX_RANGES else ""
         card.add(quantity, channel, _exact(np.sum(runs[:, 1] - runs[:, 0] + 1) if rows is None else rows), note=note)
 
     if repeats and repeats[0] > _REPEATING_PART:
-        card.doubts.append(f"{table}: the sent rows repeat, so that a loss of whole periods is not visible")
+        card.evidence_gaps.append(f"{table}: the sent rows repeat, so that a loss of whole periods is not visible")
     add("missing rows", table, found.lost)
     for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
         add(quantity, table, stretches(np.unique(pairs[:, 0])), len(pairs))
 
     def hashes() -> Iterator[np.ndarray]:
         return (
-            row_hashes(each[:, :sound]).view(np.int64) for each in adapt(Sent(session, groups, one.step, one.phase))
+            row_hashes(each[:, :sound]).view(np.int64) for each in convert(Sent(session, groups, one.step, one.phase))
         )
 
     foreign, early = found.foreign, one.early
@@ -155,7 +155,7 @@ def _score_rows(
         near = row_hashes(take_rows(counts(first), 0, 2 * _EDGE_ROWS, len(names))[:, :sound]).view(np.int64)
         outside = (np.arange(len(near)) < edge - first) == (which == "first")
         if holds_session_rows(near, outside, judged, hashes):
-            card.doubts.append(f"{table}: unjudged rows {side} the session equal a run of rows in it")
+            card.evidence_gaps.append(f"{table}: unjudged rows {side} the session equal a run of rows in it")
     add("foreign rows", table, stretches(foreign + one.early), numbered=False)
     for name, altered in zip(names, found.altered, strict=True):
         add("altered values", name, altered.pairs(), altered.rows)

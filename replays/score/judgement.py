@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from replays.recordings.formats import mapping as formats
-from replays.score.alignment.placing import SignalRows, identify_signals
+from replays.score.alignment.row_matching import SignalRows, identify_signals
 from replays.score.analogue import score_analogue
 from replays.score.card.limits import ScoreLimits, load_limits
 from replays.score.card.scorecard import (
@@ -117,7 +117,7 @@ def judge(
     else:
         fitted = score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
         score_converter(card, fitted)
-    card.doubts += _missing_evidence(card, due)
+    card.evidence_gaps += _missing_evidence(card, due)
     return card
 
 
@@ -194,11 +194,11 @@ def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, r
             verdict = PASS if wire.channel == name else FAIL
         card.rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
         if wire.channel:
-            turned = wire.polarity < 0 if scale is None else scale.turned
-            open_ = wire.turned if scale is None else not scale.known
-            verdict = INCONCLUSIVE if open_ else FAIL if turned else PASS
-            note = "inverted half a period later" if wire.turned and open_ else ""
-            card.rows.append(text_row(card.path, "polarity", name, "turned" if turned else "as sent", verdict, note))
+            inverted = wire.polarity < 0 if scale is None else scale.inverted
+            open_ = wire.ambiguous if scale is None else not scale.known
+            verdict = INCONCLUSIVE if open_ else FAIL if inverted else PASS
+            note = "inverted half a period later" if wire.ambiguous and open_ else ""
+            card.rows.append(text_row(card.path, "polarity", name, "turned" if inverted else "as sent", verdict, note))
     taken = [wire.channel for wire in wires.values() if wire.channel]
     for channel in dict.fromkeys(each for each in taken if taken.count(each) > 1):
         names = ", ".join(name for name, wire in wires.items() if wire.channel == channel)

@@ -44,7 +44,7 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
             [_matrix_row(line[0], line[part]) for line in lines if any(line[part])],
             caption="+ pass, X fail, ? inconclusive",
         )
-    for line in (*card.doubts, *card.findings):
+    for line in (*card.evidence_gaps, *card.findings):
         report.text(line)
     rows = sorted(card.rows, key=lambda row: list(_MARKS).index(row.verdict))
     report.heading("Scorecard")

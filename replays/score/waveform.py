@@ -27,7 +27,7 @@ _PASSES = 3
 """Fits with a filter, each with the signal at the times that the previous one found."""
 _ORDERS = 8
 """Orders of Butterworth low-passes that are tried."""
-_SETTLING = 8.0
+_TRANSIENT_PERIODS = 8.0
 """Periods of the corner that are excluded at each end of a record, for a filter to settle."""
 _LOG_STEP, _MAX_LOG_CHANGE = 1e-4, 0.5
 """Logarithm of the corner: step of its numerical derivative, and largest change from its first estimate."""
@@ -42,7 +42,7 @@ class Waveform:
     Attributes:
         gain, offset, late_s, drift, bend: Fitted values [1, unit, s, s/s, 1/s]; `late_s`, `drift` are means.
         covariance: Covariance of the five parameters, shape (5, 5).
-        freedom: Degrees of freedom of the five variances, shape (5,).
+        dof: Degrees of freedom of the five variances, shape (5,).
         middle_s, half_s: Middle of the fitted rows by the clock of the file, and half of their length [s].
         times_s: Times of the fitted rows by the clock of the file [s], shape (n,).
         values: Recorded values [unit], shape (n,).
@@ -56,7 +56,7 @@ class Waveform:
     drift: float
     bend: float
     covariance: np.ndarray
-    freedom: np.ndarray
+    dof: np.ndarray
     middle_s: float
     half_s: float
     times_s: np.ndarray
@@ -71,9 +71,9 @@ class Waveform:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def half(self) -> np.ndarray:
+    def half_widths(self) -> np.ndarray:
         """Half of the 95 % intervals of the five, shape (5,)."""
-        return student(self.freedom) * self.spread
+        return student(self.dof) * self.spread
 
     def late_at(self, times_s: np.ndarray) -> np.ndarray:
         """Return the time of the stimulus less time of the record, at times of the record [s], shape (n,)."""
@@ -160,15 +160,15 @@ def _solve(
     begun[: len(moved)] += moved
     residual = residual - jacobian @ step
     units = np.array([1.0, 1.0, 1.0, span, 0.5 * span**2])
-    covariance, freedom = np.diag([0.0, 0.0, 0.0, 0.0, units[4] ** 2]), np.ones(5)
+    covariance, dof = np.diag([0.0, 0.0, 0.0, 0.0, units[4] ** 2]), np.ones(5)
     if final:
         fitted = slice(jacobian.shape[1])
-        change, residual, covariance[fitted, fitted], freedom[fitted] = refine(jacobian, residual)
+        change, residual, covariance[fitted, fitted], dof[fitted] = refine(jacobian, residual)
         step = step + change
         begun[: len(moved)] += change[2:]
     return Waveform(
         float(gain + step[0]), float(offset + step[1]), float(begun[0]), float(begun[1] / span),
-        float(2.0 * begun[2] / span**2), covariance / np.outer(units, units), freedom, centre, span,
+        float(2.0 * begun[2] / span**2), covariance / np.outer(units, units), dof, centre, span,
         t[use], y[use], s, ds, residual,
     )  # fmt: skip
 
@@ -319,7 +319,7 @@ def _fit_filter(
     n = int(places[-1]) + 1
     # The filter's delay at low frequencies, by default.
     delay_s = 1.0 / (2.0 * math.pi * corner_hz * math.sin(math.pi / (2.0 * order))) if late_s is None else late_s
-    cut = math.ceil(_SETTLING / (corner_hz * step_s))
+    cut = math.ceil(_TRANSIENT_PERIODS / (corner_hz * step_s))
     # Without the transients of the filter at the ends.
     kept = slice(*np.searchsorted(places, (cut, n - cut)))
     if n < 8 * cut + _MIN_SAMPLES or kept.stop - kept.start < _MIN_SAMPLES:
@@ -354,15 +354,15 @@ def _fit_filter(
             break
     assert solved is not None
     s, ds, matrix, parts = solved
-    change, residual, covariance, freedom = refine(matrix, y[kept] - matrix @ parts)
+    change, residual, covariance, dof = refine(matrix, y[kept] - matrix @ parts)
     parts = parts + change
     delay_s, log = delay_s + float(change[2]), log + float(change[5])
     units = np.array([1.0, 1.0, 1.0, 0.5 * span_s, 0.125 * span_s**2, 1.0])
     covariance = covariance / np.outer(units, units)
-    half = float(student(freedom[5])) * math.sqrt(covariance[5, 5])
+    half = float(student(dof[5])) * math.sqrt(covariance[5, 5])
     fitted = Waveform(
         float(parts[0]), float(parts[1]), found.late_s + float(delay_s),
         found.drift + float(parts[3]) / (0.5 * span_s), found.bend + float(parts[4]) / (0.125 * span_s**2),
-        covariance[:5, :5], freedom[:5], found.middle_s, found.half_s, found.times_s[kept], y[kept], s, ds, residual,
+        covariance[:5, :5], dof[:5], found.middle_s, found.half_s, found.times_s[kept], y[kept], s, ds, residual,
     )  # fmt: skip
     return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))

@@ -92,8 +92,8 @@ def _laboratory() -> ChannelTable:
 
 
 _SENSORS = {"engine.companion": False}
-SPARSE = {"sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
-_DIES_OUT = [{"at_s": 0.02, "command": "hammer", "force_n": 100.0, "duration_ms": 2.0}]
+_LOW_RATES = {"sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
+_SINGLE_IMPACT = [{"at_s": 0.02, "command": "hammer", "force_n": 100.0, "duration_ms": 2.0}]
 
 CASES = (
     BenchCase("split 1e-3, hammer", "hammer", _split(1e-3), goal=450, error_goal=2e-3),
@@ -103,8 +103,8 @@ CASES = (
     BenchCase("tsit5 1e-6, hammer", "hammer", _engine("tsit5", 500, **{"engine.tolerance": 1e-6})),
     BenchCase("rk8 1e-8, hammer", "hammer", _engine("rk8", 25)),
     BenchCase("taylor 1e-8, hammer", "hammer", _engine("taylor", 25, **{"engine.tolerance": 1e-8}), error_goal=1e-6),
-    BenchCase("split 1e-4, free flight, a row every 10 ms", "stable-run", _split(1e-4, **SPARSE), 20.0, goal=20000),
-    BenchCase("split 1e-4, 60 s: bounces, then free", "hammer", _split(1e-4, commands=_DIES_OUT), 60.0, goal=500),
+    BenchCase("split 1e-4, free flight, a row every 10 ms", "stable-run", _split(1e-4, **_LOW_RATES), 20.0, goal=20000),
+    BenchCase("split 1e-4, 60 s: bounces, then free", "hammer", _split(1e-4, commands=_SINGLE_IMPACT), 60.0, goal=500),
     BenchCase("split 1e-4, 60 s: bounces, then whirl", "hammer", _split(1e-4), 60.0, goal=3000),
     BenchCase("split, hammer, all sensors at 20 kHz", "hammer", _SENSORS, goal=120, blocks=True),
     BenchCase("the same with its companion", "hammer", {}, blocks=True),
@@ -248,7 +248,7 @@ def _cheapest(
 ) -> list[tuple[str, float, Setting, float]]:
     """Return the fastest setting of a peer's refined ladder whose error is at most the given one, if any."""
     found: tuple[float, Setting, float] | None = None
-    for setting in _with_steps_between(PEERS[name].ladder):
+    for setting in _refine_ladder(PEERS[name].ladder):
         solution = PEERS[name].solve(problem, setting, budget_s=30.0)
         if solution.failure is not None:
             continue
@@ -258,7 +258,7 @@ def _cheapest(
     return [] if found is None else [(name, wanted, found[1], found[2])]
 
 
-def _with_steps_between(ladder: tuple[Setting, ...]) -> list[Setting]:
+def _refine_ladder(ladder: tuple[Setting, ...]) -> list[Setting]:
     """Return a ladder refined to three tolerances per decade, so that no peer has to use a needlessly fine one."""
     finer = list(ladder)
     for above, below in pairwise(ladder):

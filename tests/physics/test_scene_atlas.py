@@ -53,7 +53,7 @@ def test_the_default_engine_is_accurate_at_each_setting(found: list[SceneOutcome
 
 def test_verlet_is_wrong_with_or_without_a_warning(found: list[SceneOutcome]) -> None:
     verlet = kinds(found, "verlet")
-    assert (verlet["50 us"], verlet["10 us"]) == ("told", "silent")
+    assert (verlet["50 us"], verlet["10 us"]) == ("warned", "silent")
 
 
 def test_an_unsupported_law_is_refused(found: list[SceneOutcome]) -> None:

@@ -243,7 +243,7 @@ def test_command_prints_stores_and_draws(tmp_path, capsys: pytest.CaptureFixture
         main([*command, "--json"])
     document = json.loads(capsys.readouterr().out)
     assert document["scenes"] == {"decided": 1, "chaotic": 0, "undecided": 0, "untold": 0, "unbounded": 0}
-    assert document["engines"][DEFAULT]["told"] == 1
+    assert document["engines"][DEFAULT]["compared"] == 1
     assert all(Path(picture).is_file() for picture in document["pictures"])
     with pytest.raises(SystemExit, match="0"):
         main(command)

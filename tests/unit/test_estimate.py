@@ -27,7 +27,8 @@ def test_intervals_of_a_line_are_those_of_the_closed_form() -> None:
     x = np.linspace(3.0, 9.0, 12)
     line = fit_line(x, 2.0 - 0.5 * x + np.random.default_rng(1).standard_normal(12))
     _, covariance = np.polyfit(x, line(x) + line.residual, 1, cov=True)
-    assert line.half == pytest.approx(2.22814 * np.sqrt(np.diag(covariance)), rel=1e-5)  # t of 10 degrees of freedom
+    # Student's t of 10 degrees of freedom.
+    assert line.half_widths == pytest.approx(2.22814 * np.sqrt(np.diag(covariance)), rel=1e-5)
 
 
 def test_a_line_through_one_instant_is_level() -> None:

@@ -91,10 +91,10 @@ def test_quantities_read_closed_forms() -> None:
     for name, value in expected.items():
         assert QUANTITIES[name].read(turning) == pytest.approx(value, rel=1e-6), name
     assert QUANTITIES["outcome"].read(turning) == "backward whirl"
-    assert find_ending(turning).word == "rolling backward whirl"
+    assert find_ending(turning).outcome == "rolling backward whirl"
     noise = np.linspace(-1e-12, 1e-12, 1000)
     standing = trace(contact_impulse=t, ring_y=-np.ones(1000), sliding_speed=noise, theta_rate=0.1 * noise)
-    assert (find_ending(standing).word, find_ending(standing).rolling_share) == ("resting", 1.0)
+    assert (find_ending(standing).outcome, find_ending(standing).rolling_share) == ("resting", 1.0)
     apart = trace(penetration=-np.ones(100), ring_x=np.ones(100))
     assert QUANTITIES["outcome"].read(apart) == "no contact"
     assert math.isnan(QUANTITIES["whirl_frequency"].read(apart))
@@ -126,7 +126,7 @@ WHIRL = Ending(touches=True, contact_share=1.0, turns=-40.0, rolling_share=1.0)
 )
 def test_outcomes_have_a_name_and_soft_limits(change: dict[str, float], word: str, alike: bool) -> None:
     other = WHIRL._replace(**change)
-    assert (other.word, WHIRL.is_alike(other), other.is_alike(WHIRL)) == (word, alike, alike)
+    assert (other.outcome, WHIRL.is_alike(other), other.is_alike(WHIRL)) == (word, alike, alike)
 
 
 def test_time_to_roll_detects_every_slip() -> None:
@@ -148,7 +148,7 @@ def test_a_model_without_friction_has_another_outcome_for_any_quantity() -> None
     )
     assert whirl is not None
     assert flight is not None
-    assert (whirl.word, flight.word) == ("rolling backward whirl", "flight")
+    assert (whirl.outcome, flight.outcome) == ("rolling backward whirl", "flight")
 
 
 def test_a_first_run_in_short_blocks_is_no_cost(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -275,7 +275,7 @@ def test_fifteen_channels_are_mapped_by_two_seconds_of_chips() -> None:
     assert [wire.channel for wire in wires.values()] == [names[k] for k in order]
     assert [wire.polarity for wire in wires.values()] == signs.tolist()
     assert {wire.rivals for wire in wires.values()} == {()}
-    assert wires["ai0"].late_s == pytest.approx(0.1)
+    assert wires["ai0"].offset_s == pytest.approx(0.1)
 
 
 def test_intervals_have_the_cramer_rao_width() -> None:
@@ -292,7 +292,7 @@ def test_intervals_have_the_cramer_rao_width() -> None:
         one * math.sqrt(24.0) / (amplitude * 2.0 * np.pi * hz * seconds),
     ]  # fmt: skip
     assert found.spread[:4] == pytest.approx(floors, rel=0.35)
-    widths = (student(found.freedom) * found.spread)[:4]
+    widths = (student(found.dof) * found.spread)[:4]
     # Gain 10 ppm, offset 20 uV, skew of two such 20 ns, clock 0.01 ppm.
     assert (widths < [10e-6, 20e-6, 20e-9 / math.sqrt(2.0), 0.01e-6]).all()
 
@@ -350,8 +350,8 @@ def test_an_interval_across_its_limit_is_inconclusive() -> None:
     assert judge_row("analogue", "start", "", (1.0, 0.0, 2.0)).verdict == NO_LIMIT
 
 
-def scorecard(*verdicts: str, doubts: tuple[str, ...] = ()) -> Scorecard:
-    card = Scorecard("DAQ", "digital", "limits", lambda *_, **__: None, doubts=list(doubts))
+def scorecard(*verdicts: str, evidence_gaps: tuple[str, ...] = ()) -> Scorecard:
+    card = Scorecard("DAQ", "digital", "limits", lambda *_, **__: None, evidence_gaps=list(evidence_gaps))
     for n, verdict in enumerate(verdicts):
         row = judge_row("digital", "altered values", f"channel {n}", (0.0, 0.0, 0.0))
         card.rows.append(replace(row, verdict=cast(Any, verdict)))
@@ -365,9 +365,9 @@ def scorecard(*verdicts: str, doubts: tuple[str, ...] = ()) -> Scorecard:
         (scorecard(NO_LIMIT), Outcome.INCONCLUSIVE),
         (scorecard(INCONCLUSIVE), Outcome.INCONCLUSIVE),
         (scorecard(PASS, NO_LIMIT, INCONCLUSIVE), Outcome.PASS),
-        (scorecard(PASS, doubts=("half of the record was not judged",)), Outcome.INCONCLUSIVE),
+        (scorecard(PASS, evidence_gaps=("half of the record was not judged",)), Outcome.INCONCLUSIVE),
         (scorecard(PASS, FAIL), Outcome.FAIL),
-        (scorecard(PASS, FAIL, doubts=("half of the record was not judged",)), Outcome.FAIL),
+        (scorecard(PASS, FAIL, evidence_gaps=("half of the record was not judged",)), Outcome.FAIL),
     ],
 )
 def test_an_outcome_is_a_pass_only_without_a_failing_quantity_and_without_a_doubt(
@@ -375,7 +375,7 @@ def test_an_outcome_is_a_pass_only_without_a_failing_quantity_and_without_a_doub
 ) -> None:
     assert card.outcome is outcome
     assert f"digital path: {outcome}" in card.verdict_line
-    assert outcome is not Outcome.INCONCLUSIVE or (card.doubts or ["no quantity passes"])[0] in card.verdict_line
+    assert outcome is not Outcome.INCONCLUSIVE or (card.evidence_gaps or ["no quantity passes"])[0] in card.verdict_line
     write_junit(card, tmp_path / "r.xml")
     first = ElementTree.parse(tmp_path / "r.xml").getroot()[0].find("testcase")
     assert first is not None

@@ -175,4 +175,4 @@ def test_a_loss_of_whole_periods_is_no_pass(period: int, lost: int, outcome: str
     kept = np.delete(counts, slice(3000, 3000 + lost), axis=0)
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(kept)), [session], path="digital")
     assert card.outcome == outcome, card.verdict_line
-    assert any("whole periods" in each for each in card.doubts) == bool(period)
+    assert any("whole periods" in each for each in card.evidence_gaps) == bool(period)

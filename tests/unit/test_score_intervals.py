@@ -42,7 +42,7 @@ def _fit(noise: float, jitter_s: float, generator: np.random.Generator, n: int =
     slope = 2000.0 * np.pi * np.cos(2000.0 * np.pi * times_s * 1.000137)
     residual = noise * generator.standard_normal(n) + jitter_s * slope * generator.standard_normal(n)
     return Waveform(
-        gain=1.0, offset=0.0, late_s=0.0, drift=0.0, bend=0.0, covariance=np.eye(5), freedom=np.ones(5), middle_s=0.0,
+        gain=1.0, offset=0.0, late_s=0.0, drift=0.0, bend=0.0, covariance=np.eye(5), dof=np.ones(5), middle_s=0.0,
         half_s=0.5 * n / 20e3, times_s=times_s, values=residual, known=slope / 6283.0, slope=slope, residual=residual,
     )  # fmt: skip
 
@@ -54,7 +54,7 @@ def _two_levels(gain: float, noise: float) -> Waveform:
     covariance = np.diag([1e-12, 1e-6, 1e-18, 1e-18, 1e-18])
     return replace(
         fit, gain=gain, known=known, values=gain * known + fit.residual, slope=0.0 * known + 1.0,
-        covariance=covariance, freedom=np.full(5, 1e4),
+        covariance=covariance, dof=np.full(5, 1e4),
     )  # fmt: skip
 
 
@@ -62,7 +62,7 @@ def test_two_levels_rounded_by_the_session_leave_the_gain_inconclusive() -> None
     # 204.8 counts, rounded to 205 with noise of a tenth of a step: off by 976 ppm, and by up to 0.4 / 205 from others.
     fit = _two_levels(204.8 / 205.0, 0.1)
     session = Converter(1.0, 0.1, values=fit.known)
-    half = widen_intervals(fit, find_undithered(fit, 0.0, session)).half[0]
+    half = widen_intervals(fit, find_undithered(fit, 0.0, session)).half_widths[0]
     assert 976e-6 < half < 0.5 / 205.0
 
 
@@ -118,8 +118,8 @@ def test_the_interval_of_stamp_jitter_follows_chi_squared() -> None:
     found = stamps.estimate_all(None)
     assert found["stamp jitter"] is not None
     value, low, high = found["stamp jitter"]
-    freedom = n // 16 * 15
-    ends = [value * math.sqrt(freedom / chi2.ppf(p, freedom)) for p in (0.975, 0.025)]
+    dof = n // 16 * 15
+    ends = [value * math.sqrt(dof / chi2.ppf(p, dof)) for p in (0.975, 0.025)]
     assert (low, high) == pytest.approx(ends, rel=2e-3)
     for name, true in (("stamp offset", 0.25), ("stamp rate", 50.0)):
         told = found[name]
@@ -138,8 +138,8 @@ def test_intervals_have_coverage_for_coloured_and_drifting_noise(noise: str) -> 
         series, mean, level = NOISES[noise](np.random.default_rng([seed, 7]), ROWS)
         ones = np.ones((ROWS, 1))
         flat, residual = np.zeros(ROWS), series - series.mean()
-        change, _, covariance, freedom = refine(ones, residual)
-        half, offset = float(student(freedom[0])) * math.sqrt(covariance[0, 0]), float(series.mean() + change[0])
+        change, _, covariance, dof = refine(ones, residual)
+        half, offset = float(student(dof[0])) * math.sqrt(covariance[0, 0]), float(series.mean() + change[0])
         found["offset"].append((offset, offset - half, offset + half, mean))
         fit = Waveform(1.0, 0.0, 0.0, 0.0, 0.0, np.eye(5), np.ones(5), 0.15, 0.15, t, series, flat, flat, residual)
         found["noise"].append((*split_noise(fit).noise, level))
@@ -168,7 +168,7 @@ def test_the_whole_interval_decides(low: float, high: float, verdict: str) -> No
 def test_a_pass_needs_a_quantity_that_passes_and_no_doubt(
     values: tuple[float, ...], doubts: list[str], outcome: str
 ) -> None:
-    card = Scorecard("a test", "analogue", "", lambda *_, **__: Bounds(-1.0, 1.0, "a test"), doubts=doubts)
+    card = Scorecard("a test", "analogue", "", lambda *_, **__: Bounds(-1.0, 1.0, "a test"), evidence_gaps=doubts)
     for value in values:
         card.add("gain", "", None if math.isnan(value) else (value, value, value))
     assert card.outcome == outcome

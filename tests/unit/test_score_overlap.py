@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from replays.score.alignment.overlap import find_begins
+from replays.score.alignment.overlap import find_starts
 from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
 from rig.channels.table import default_table
@@ -179,7 +179,7 @@ def test_a_record_of_stale_rows_does_not_pass(which: str, repeats: bool, tmp_pat
     daq = np.concatenate([whole[first:last] for first, last in STALE_RANGES[which]])
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
     assert card.outcome != "pass", card.remarks
-    doubts = "\n".join(card.doubts)
+    doubts = "\n".join(card.evidence_gaps)
     assert "equal a run of rows in it" in doubts or {"doubled rows", "swapped rows"} & {row for row, _ in red(card)}
 
 
@@ -191,10 +191,10 @@ def test_stale_rows_in_one_table_of_several_do_not_pass(tmp_path: Path) -> None:
     daq = write_session(tmp_path / "daq.mcap", {"probes": probes, "hammer": whole["hammer"][3000:9000]})
     card = judge(daq, [session])
     assert (card.path, card.outcome) == ("digital", "inconclusive"), card.verdict_line
-    assert "probes: unjudged rows after the session equal a run of rows in it" in card.doubts
+    assert "probes: unjudged rows after the session equal a run of rows in it" in card.evidence_gaps
 
 
 def test_a_start_without_unequal_rows_is_found_despite_longer_overlaps() -> None:
     whole = make_repeating(40_000, 1, np.random.default_rng(1))[:, 0]
-    places = find_begins([whole[29_500:]], [whole[:30_000]], 1, 500)
+    places = find_starts([whole[29_500:]], [whole[:30_000]], 1, 500)
     assert 29_500 in places

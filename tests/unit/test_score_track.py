@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from replays.score.alignment.alignment import align
-from replays.score.alignment.one_begin import RowSource
 from replays.score.alignment.repeats import find_repeats
 from replays.score.alignment.row_times import Follower, Track, follow_record
+from replays.score.alignment.single_start import RowSource
 from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
 from replays.score.judgement import judge
 from replays.score.records.stimulus import Exact
@@ -157,7 +157,7 @@ def test_a_drifting_clock_is_followed() -> None:
 
 
 def test_a_repeating_signal_uses_the_start_that_explains_all_signals() -> None:
-    """A keyphasor's pulse is a millisecond off at the begin at which the probes show the same whirl."""
+    """A keyphasor's pulse is a millisecond off at the start at which the probes show the same whirl."""
 
     def pulse(t: np.ndarray) -> np.ndarray:
         return 1.0 / (1.0 + np.exp(-200.0 * (np.sin(2.0 * np.pi * 46.1 * t) - 0.9)))
@@ -174,8 +174,8 @@ def test_a_repeating_signal_uses_the_start_that_explains_all_signals() -> None:
         )
     found = align(sources)
     assert found is not None
-    assert not found.ambiguous  # at each of the other begins the pulse is at another part of the whirl
-    assert found.begin_s == pytest.approx(repeat_s, abs=1e-6)
+    assert not found.ambiguous  # at each of the other starts the pulse is at another part of the whirl
+    assert found.shift_s == pytest.approx(repeat_s, abs=1e-6)
     assert found.own_s["keyphasor"] == pytest.approx(found.own_s["disk_x"], abs=1e-6)
 
 
@@ -187,7 +187,7 @@ def make_slow_sources(
     signals: Sequence[Callable[[np.ndarray], np.ndarray]], kept: np.ndarray, *, begin_s: float, found_s: float,
     end_s: float, noise: float,
 ) -> list[RowSource]:  # fmt: skip
-    """Return probes that were recorded from a begin on, and were first found at another one."""
+    """Return probes that were recorded from a start on, and were first found at another one."""
     generator, table = np.random.default_rng(0), list(default_table().channels.values())
     wire = Wire("", 1, 1.0, (), False, found_s, (0.0, 0.7), (begin_s,), found_s)
     return [
@@ -201,7 +201,7 @@ def make_slow_sources(
 
 
 def test_a_start_without_jumps_is_preferred() -> None:
-    """Turns of a rotor differ by some samples: early begins explain rows after the session by steps; a loss is one."""
+    """Turns of a rotor differ by some samples: early starts explain rows after the session by steps; a loss is one."""
 
     def angle(t: np.ndarray) -> np.ndarray:
         return 2.0 * np.pi * 5.0 * (t + 7e-4 * np.sin(2.0 * np.pi * (t + 0.6 * t**2)))
@@ -210,7 +210,7 @@ def test_a_start_without_jumps_is_preferred() -> None:
     kept = np.delete(np.arange(3301), lost)
     found = align(make_slow_sources(signals, kept, begin_s=1.3, found_s=1.1, end_s=2.0, noise=6e-3))
     assert found is not None
-    assert found.begin_s == pytest.approx(0.2, abs=2e-5)
+    assert found.shift_s == pytest.approx(0.2, abs=2e-5)
     ((first, last, size),) = found.track.steps()
     assert first <= lost <= last
     assert size == 1
@@ -302,7 +302,7 @@ def test_rows_before_a_frozen_channel_stay_inside_the_session(tmp_path: Path) ->
 
 @pytest.mark.parametrize(("at", "names"), [(8000, 4), (10_000, 2)])
 def test_a_replaced_block_does_not_move_the_record_out_of_the_session(at: int, names: int, tmp_path: Path) -> None:
-    """Judged up to the fault only, a wrong begin leaves a smaller residual than the right one."""
+    """Judged up to the fault only, a wrong start leaves a smaller residual than the right one."""
     sent = Sessions(tmp_path / "sessions").get("test-two-tone", first_s=61.0)
     volts = Converter(61.2, 20_000).volts(sent, np.random.default_rng(3))
     volts[at : at + 200] = volts[at - 200 : at]
@@ -418,7 +418,7 @@ def test_clock_is_the_mean_and_its_drift_fails(session: Path, tmp_path: Path) ->
 
 
 def test_an_idle_start_of_a_repeating_signal_begins_with_the_session(session: Path, tmp_path: Path) -> None:
-    """Later begins explain the same rows; with them the idle rows would be in the session."""
+    """Later starts explain the same rows; with them the idle rows would be in the session."""
     idle = np.full(2000, 0.0125)  # where the signal is zero
     card = card_of(session, tmp_path / "daq.parquet", np.concatenate([idle, 0.004 + np.arange(8001) / RATE_HZ]))
     assert red(card) == set()
@@ -429,7 +429,7 @@ def test_an_idle_start_of_a_repeating_signal_begins_with_the_session(session: Pa
 def test_quiet_rows_outside_a_repeating_session_are_not_judged(
     before_s: float, taken_s: float, after_s: float, tmp_path: Path
 ) -> None:
-    """Hundreds of begins by whole periods explain the same rows; few of these leave the quiet rows outside."""
+    """Hundreds of starts by whole periods explain the same rows; few of these leave the quiet rows outside."""
     sent = Sessions(tmp_path / "sessions").get("test-sine", seed=80, first_s=61.0)
     begin_s = 61.0 - before_s if before_s else 63.0 - taken_s
     rows = round((before_s + taken_s + after_s) * RATE_HZ)
@@ -444,7 +444,7 @@ def test_quiet_rows_outside_a_repeating_session_are_not_judged(
 
 
 def test_exchanged_signals_a_quarter_turn_apart_are_detected() -> None:
-    """A later begin and another polarity explain one of the two pairs, not both."""
+    """A later start and another polarity explain one of the two pairs, not both."""
     t = np.arange(20_000) / RATE_HZ
     signals = {"disk_x": np.cos, "disk_y": np.sin, "ring_x": np.cos, "ring_y": np.sin}
     sent = {name: (signal(2.0 * np.pi * 27.0 * t), 20e3) for name, signal in signals.items()}

@@ -244,12 +244,12 @@ def _cases(path: Path, file: _File) -> Iterator[Case]:
     scenes: dict[str, Scene] = {}
     stem = path.name.removesuffix(SUFFIX)
     for chosen in itertools.product(*(values for _, values in axes)):
-        picked = {name: value for (name, _), value in zip(axes, chosen, strict=True)}
-        named = {name.rpartition(" ")[2]: label for name, (label, _) in picked.items()}
-        yield _case(path, file, picked, named, ",".join(named.values()) or stem, scenes)
+        entries = {name: entry for (name, _), entry in zip(axes, chosen, strict=True)}
+        labels = {name.rpartition(" ")[2]: label for name, (label, _) in entries.items()}
+        yield _case(path, file, entries, labels, ",".join(labels.values()) or stem, scenes)
 
 
-_Picked = Mapping[str, tuple[str, Any]]
+_Entries = Mapping[str, tuple[str, Any]]
 
 
 def _axes(file: _File) -> Iterator[tuple[str, list[tuple[str, Any]]]]:
@@ -280,7 +280,7 @@ def _fault_name(fault: Mapping[str, Any], number: int) -> str:
 
 
 def _case(
-    path: Path, file: _File, picked: _Picked, named: Mapping[str, str], name: str, scenes: dict[str, Scene]
+    path: Path, file: _File, picked: _Entries, named: Mapping[str, str], name: str, scenes: dict[str, Scene]
 ) -> Case:  # fmt: skip
     values = {axis: value for axis, (_, value) in picked.items()}
     scene_name = values.get("scene", file.scene)
@@ -382,7 +382,7 @@ def _step(
         note = check(_Note, one, field=field)
         step = Step(note.at_s, None, note.note, tuple(note.tags))
     else:
-        step = Step(check(_At, {"at_s": one.pop("at_s", None)}, field=field).at_s, None)
+        step = Step(check(_Timed, {"at_s": one.pop("at_s", None)}, field=field).at_s, None)
         name = one.pop("command", None)
         if not isinstance(name, str):
             must = f"given ({', '.join(COMMANDS)}), or a note"
@@ -400,11 +400,11 @@ def _step(
     return step
 
 
-class _At(Written):
+class _Timed(Written):
     at_s: Time
 
 
-class _Note(_At):
+class _Note(_Timed):
     note: Line
     tags: list[str] = Field(default=[])
 

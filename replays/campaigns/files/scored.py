@@ -96,7 +96,7 @@ class ExpectScore(Expected):
                 found.append((row.channel, text, Outcome(row.verdict)))
         failing = [(channel, text) for channel, text, outcome in found if outcome is Outcome.FAIL]
         reasons = [text for _, text, outcome in found if outcome is Outcome.INCONCLUSIVE]
-        reasons += card.doubts if self.score == "all" else []
+        reasons += card.evidence_gaps if self.score == "all" else []
         limits = [row.limit.source for row in rows if row.verdict == FAIL and row.limit is not None]
         shown, hidden = (sum(row.verdict == verdict for row in rows) for verdict in (PASS, INCONCLUSIVE))
         note = f"{card.path} path, {shown} quantities pass, {hidden} inconclusive"

@@ -82,7 +82,7 @@ def identification_document(found: Identification, *, recording: str) -> dict[st
         "fits": judgement.fits,
         "white": judgement.white,
         "chi2_per_degree_of_freedom": judgement.chi2,
-        "degrees_of_freedom": judgement.freedom,
+        "degrees_of_freedom": judgement.dof,
         "simultaneous_over_single_intervals": judgement.together,
         "interval_inflation": judgement.inflation,
         "values": {

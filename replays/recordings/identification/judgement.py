@@ -76,7 +76,7 @@ class Judgement:
         correlation: Correlation of the identified unknowns, nan elsewhere, shape (unknowns, unknowns).
         singular_values: Singular values of the Jacobian in units of the noise and of each unknown's reach, descending.
         chi2: Sum of squares of the residuals over the noise, per degree of freedom.
-        freedom: Degrees of freedom.
+        dof: Degrees of freedom.
         together: Factor for simultaneous 95 % intervals.
         inflation: Largest factor by which an interval exceeds that from noise alone.
         channels: Fit of each channel.
@@ -86,7 +86,7 @@ class Judgement:
     correlation: np.ndarray
     singular_values: np.ndarray
     chi2: float
-    freedom: int
+    dof: int
     together: float
     inflation: float
     channels: tuple[ChannelFit, ...]
@@ -94,7 +94,7 @@ class Judgement:
     @property
     def fits(self) -> bool:
         """True if the residuals are no larger than the noise."""
-        return _is_explained(self.chi2, self.freedom)
+        return _is_explained(self.chi2, self.dof)
 
     @property
     def white(self) -> bool:
@@ -126,9 +126,9 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     reach = np.array([unknown.reach / unknown.scale for unknown in unknowns])
     count = int(known.sum())
     _, singular, directions = np.linalg.svd(triangular_factor(slopes * reach))
-    freedom = max(1, count - len(unknowns))
-    chi2 = float((residuals**2).sum()) / freedom
-    quantile = float(student(freedom))
+    dof = max(1, count - len(unknowns))
+    chi2 = float((residuals**2).sum()) / dof
+    quantile = float(student(dof))
     unsure = _CHI2_TOLERANCE if "measured" in observation.noise_from else 0.0
     spread = 1.0 + _ERROR_RATIO * _misfit(residuals, known, unsure) / quantile
     observable = quantile * spread < singular  # the 95 % interval along the direction is within the reach
@@ -143,7 +143,7 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     channels = tuple(
         _channel(name, residuals[:, column], known[:, column]) for column, name in enumerate(observation.names)
     )
-    if not _is_explained(chi2, freedom) or sum(not channel.white for channel in channels) > len(channels) // 10:
+    if not _is_explained(chi2, dof) or sum(not channel.white for channel in channels) > len(channels) // 10:
         covariance = _max_covariance(covariance, plain @ _scores(slopes * reach, residuals) @ plain)
     stretch = _widenings(window, z, covariance * np.outer(reach, reach), residuals, known, far=quantile, spread=spread)
     covariance = _with_priors(covariance * np.outer(stretch, stretch), unknowns, reach)
@@ -156,7 +156,7 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     for place, unknown in enumerate(unknowns):
         half = quantile * deviation[place] * unknown.reach
         finding = _finding(place, unknowns, float(values[place]), half, alone=alone, blind=blind, part=part)
-        findings.append(finding if _is_explained(chi2, freedom) else _drop_result(finding))
+        findings.append(finding if _is_explained(chi2, dof) else _drop_result(finding))
     correlation = np.full(covariance.shape, np.nan)
     identified = np.array([finding.standing == "identified" for finding in findings])
     both = np.outer(identified, identified) & (np.outer(deviation, deviation) > 0.0)
@@ -166,7 +166,7 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
         correlation=correlation,
         singular_values=singular,
         chi2=chi2,
-        freedom=freedom,
+        dof=dof,
         together=_simultaneous_factor(correlation[np.ix_(identified, identified)]),
         inflation=inflation,
         channels=channels,
@@ -200,8 +200,8 @@ def _drop_result(finding: Finding) -> Finding:
     return Finding(finding.unknown, finding.value, math.inf, "not explained", words)
 
 
-def _is_explained(chi2: float, freedom: int) -> bool:
-    return chi2 < 1.0 + _CHI2_TOLERANCE + _CHI2_SIGMAS * math.sqrt(2.0 / freedom)
+def _is_explained(chi2: float, dof: int) -> bool:
+    return chi2 < 1.0 + _CHI2_TOLERANCE + _CHI2_SIGMAS * math.sqrt(2.0 / dof)
 
 
 def _simultaneous_factor(correlation: np.ndarray) -> float:

@@ -81,7 +81,7 @@ def _decimation(found: Identification) -> str:
 def fit_line(found: Identification) -> str:
     """Return the goodness of the fit."""
     judgement = found.judgement
-    line = f"chi2 {judgement.chi2:.4g} per degree of freedom ({judgement.freedom}); {judgement.verdict}"
+    line = f"chi2 {judgement.chi2:.4g} per degree of freedom ({judgement.dof}); {judgement.verdict}"
     if judgement.fits and judgement.inflation > 1.1:
         line += f"; intervals up to {judgement.inflation:.2g} times as wide as from noise alone"
     if judgement.together > 1.0:

@@ -29,7 +29,7 @@ from replays.recordings.validation.explanations.attribution import (
 )
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import find_common_delay
-from replays.recordings.validation.explanations.numbers import find_changes
+from replays.recordings.validation.explanations.model_parameters import find_changes
 from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
 from replays.recordings.validation.outcome import Validation

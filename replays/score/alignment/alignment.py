@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from replays.score.alignment.begins import EQUAL_BALANCE_PART, MAX_FOLLOWED, Begins, trim_quiet_ends
-from replays.score.alignment.one_begin import MIN_ROWS, Alignment, RowSource, find_busiest, follow
+from replays.score.alignment.candidate_starts import EQUAL_BALANCE_PART, MAX_FOLLOWED, Candidates, trim_quiet_ends
+from replays.score.alignment.single_start import MIN_ROWS, Alignment, RowSource, find_busiest, follow
 
 _STRETCHES_S = (0.25, 0.03)
 """Lengths of the first fitted stretch [s]; the second one if clocks differ, or samples are lost, in the first."""
@@ -34,7 +34,7 @@ def align(sources: Sequence[RowSource]) -> Alignment | None:
 
     def stretches(shift_s: float) -> list[tuple[int, int]]:
         """Return stretches that are in the session from a start."""
-        ends_s = [each - one.late_s - shift_s - one.first_s for each in one.stimulus.span_s]
+        ends_s = [each - one.offset_s - shift_s - one.first_s for each in one.stimulus.span_s]
         first, last = (min(rows, max(0, round(each * one.rate_hz))) for each in ends_s)
         if last - first < MIN_ROWS or (first <= default[0][0] and default[0][1] <= last):
             return default
@@ -42,14 +42,14 @@ def align(sources: Sequence[RowSource]) -> Alignment | None:
 
     if not one.wire.others_s:
         return follow(sources, 0.0, default)
-    begins = Begins(one, sources, stretches)
-    begins.follow_candidates([0.0, *(each - one.wire.late_s for each in one.wire.others_s)])
+    candidates = Candidates(one, sources, stretches)
+    candidates.follow_candidates([0.0, *(each - one.wire.offset_s for each in one.wire.others_s)])
     for _ in range(_MAX_SEARCHES):
-        begins.follow_candidates(begins.find_shifts())
-    alike, found = _follow_best(begins, sources)
+        candidates.follow_candidates(candidates.find_shifts())
+    alike, found = _follow_best(candidates, sources)
     if found and all(each.track.steps() for each in found):
-        begins.search_more_signals()
-        alike, found = _follow_best(begins, sources)
+        candidates.search_more_signals()
+        alike, found = _follow_best(candidates, sources)
     if not found:
         return follow(sources, 0.0, default)
     most = max(each.balance for each in found)
@@ -59,7 +59,7 @@ def align(sources: Sequence[RowSource]) -> Alignment | None:
         each, alike_in_all = found[n], left[n] <= min(left) + _EQUAL_LOG_POWER
         contradicted = any(left[m] < left[n] and _contradicts(other, each) for m, other in enumerate(found))
         balanced = each.balance > EQUAL_BALANCE_PART * most
-        return not contradicted, balanced, -begins.penalty(each), alike_in_all, each.upright, -abs(each.begin_s)
+        return not contradicted, balanced, -candidates.penalty(each), alike_in_all, each.upright, -abs(each.shift_s)
 
     best = found[max(range(len(found)), key=rank)]
     steps = len(best.track.steps())
@@ -73,11 +73,11 @@ def align(sources: Sequence[RowSource]) -> Alignment | None:
     return replace(trim_quiet_ends(best, one), ambiguous=len(alike) > 1, steps_doubted=doubted)
 
 
-def _follow_best(begins: Begins, sources: Sequence[RowSource]) -> tuple[list[Alignment], list[Alignment]]:
+def _follow_best(candidates: Candidates, sources: Sequence[RowSource]) -> tuple[list[Alignment], list[Alignment]]:
     """Return the starts that none surpasses by some signals, and the alignments of the first of them by all signals."""
-    alike = begins.find_best()
-    shifts_s = [each.begin_s for each in alike[:MAX_FOLLOWED]]
-    return alike, [each for s in shifts_s if (each := follow(sources, s, begins.stretches(s)))]
+    alike = candidates.find_best()
+    shifts_s = [each.shift_s for each in alike[:MAX_FOLLOWED]]
+    return alike, [each for s in shifts_s if (each := follow(sources, s, candidates.stretches(s)))]
 
 
 def _contradicts(other: Alignment, found: Alignment) -> bool:
@@ -87,7 +87,7 @@ def _contradicts(other: Alignment, found: Alignment) -> bool:
     of the difference, and with these explain rows after the session's end.
     """
     return any(
-        run.begin <= max(0, first - MIN_ROWS) and min(found.rows, last + MIN_ROWS) <= run.end
+        run.start <= max(0, first - MIN_ROWS) and min(found.rows, last + MIN_ROWS) <= run.end
         for first, last, _ in found.track.steps()
         for run in other.track.runs
     )
@@ -103,7 +103,7 @@ def _log_residual_power(found: Alignment, sources: Sequence[RowSource]) -> float
     for one in sources:
         values, times_s, (late_s, pace, bend) = found.even(one)
         since_s = times_s - 0.5 * (times_s[0] + times_s[-1])
-        own_s = found.own_s.get(one.name, one.late_s + found.begin_s)
+        own_s = found.own_s.get(one.name, one.offset_s + found.shift_s)
         at_s = times_s + late_s - own_s + common_s + since_s * (pace + bend * since_s)
         held = np.isfinite(values) & (at_s >= one.stimulus.span_s[0]) & (at_s <= one.stimulus.span_s[1])
         known = one.stimulus(at_s[held])[0]

@@ -29,7 +29,7 @@ _MIN_UNEQUAL, _MAX_PART_UNEQUAL = 7.0, 0.2
 _Pieces = Callable[[], Iterable[np.ndarray]]
 
 
-def find_begins(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step: int, fewest: int) -> list[int]:
+def find_starts(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step: int, fewest: int) -> list[int]:
     """Return places among the sent rows at which the first recorded row may be; negative ones before the session.
 
     The most probable is first. Where a signal repeats, the place with most rows in common is not always correct.
@@ -51,17 +51,17 @@ def find_begins(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step
         same = hashes[at] == there
         pairs.append(np.column_stack([rows[at[same]], places[same] - step * rows[at[same]]]))
         last = int(places[-1]) if len(places) else last
-    at, begins = np.concatenate(pairs).T
+    at, starts = np.concatenate(pairs).T
     if not len(at):
         return []
-    values, which, votes = np.unique(begins, return_inverse=True, return_counts=True)
+    values, which, votes = np.unique(starts, return_inverse=True, return_counts=True)
     most = which == np.argmax(votes)
-    places, first = begins + step * at, int(np.argmin(np.where(most, at, at.max() + 1)))
+    places, first = starts + step * at, int(np.argmin(np.where(most, at, at.max() + 1)))
     # Each lost row moves the rows after it: an earlier stretch than the longest one shows where it begins, unless its
     # rows recur within the longest one, as rows before the session may.
     clear = votes[which] >= max(_MIN_VOTES, 0.01 * votes.max())
     clear &= most | ((at < at[first]) & (places < places[first]))
-    likeliest = begins[clear][np.argmin(at[clear])][None] if clear.any() else begins[:0]
+    likeliest = starts[clear][np.argmin(at[clear])][None] if clear.any() else starts[:0]
     # Most starts of a nearly repeating signal have some unequal rows: one without may have few rows in the session.
     held, ranked = np.sort(rows), np.argsort(-votes)[: len(votes) if votes.max() >= _MIN_VOTES else 0]
     inside = np.searchsorted(held, (last - values) // step, side="right") - np.searchsorted(held, -(values // step))
@@ -82,8 +82,8 @@ def holds_session_rows(rows: np.ndarray, outside: np.ndarray, judged: range, sen
         judged: Places in the session of rows that are excluded.
         sent: Function that returns the hashes of the session's rows in pieces, int64, each shape (m,).
     """
-    begins = np.array(find_begins([rows[outside]], sent(), 1, int(outside.sum())), dtype=np.int64)[:, None]
-    places, at = begins - np.argmax(outside) + np.arange(len(rows)), 0
+    starts = np.array(find_starts([rows[outside]], sent(), 1, int(outside.sum())), dtype=np.int64)[:, None]
+    places, at = starts - np.argmax(outside) + np.arange(len(rows)), 0
     there = np.zeros_like(places)
     for piece in sent():
         inside = (places >= at) & (places < at + len(piece))
@@ -91,7 +91,7 @@ def holds_session_rows(rows: np.ndarray, outside: np.ndarray, judged: range, sen
     equal, beside = there == rows, (there != 0) & ~outside
     part = np.min((1 + (beside & ~equal).sum(1)) / (1 + beside.sum(1)), initial=_MAX_PART_UNEQUAL)
     equal &= outside & ((places < judged.start) | (places >= judged.stop))
-    moving = np.cumsum(np.tile(np.diff(rows, append=rows[-1:]) != 0, len(begins)))
+    moving = np.cumsum(np.tile(np.diff(rows, append=rows[-1:]) != 0, len(starts)))
     longest = np.diff(moving[stretches(np.flatnonzero(equal))]).max(initial=0)  # without constant rows
     return bool(part * longest > _MIN_UNEQUAL + math.log(1.0 + part * len(rows)))
 

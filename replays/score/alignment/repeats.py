@@ -45,10 +45,10 @@ def find_repeats(values: np.ndarray, first_s: float, found: Waveform, stimulus: 
     valid = slice(*np.flatnonzero(overlap >= max(_MIN_OVERLAP_ROWS, _MIN_OVERLAP * min(n, rows)))[[0, -1]] + [0, 1])
     here, there, overlap = here[valid], there[valid], overlap[valid]
 
-    def power(signal: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def power(signal: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (signal, signal**2))
-        total = sums[begin + overlap] - sums[begin]
-        return total, squares[begin + overlap] - squares[begin] - total**2 / overlap
+        total = sums[start + overlap] - sums[start]
+        return total, squares[start + overlap] - squares[start] - total**2 / overlap
 
     total, power_y = power(y, here)
     likeness = np.zeros((len(overlap), _FACTOR))

@@ -76,12 +76,12 @@ class RowRun:
     """Consecutive rows that the known signal explains, without a step.
 
     Attributes:
-        begin, end: First row, and the row after the last.
+        start, end: First row, and the row after the last.
         lag: Delay of these rows in the session relative to the rows of the first stretch [samples].
         doubt: First and last possible row of the step before this run.
     """
 
-    begin: int
+    start: int
     end: int
     lag: int
     doubt: tuple[int, int]
@@ -104,17 +104,17 @@ class Track:
     @property
     def explained(self) -> int:
         """Number of rows that the known signal explains."""
-        return sum(run.end - run.begin for run in self.runs)
+        return sum(run.end - run.start for run in self.runs)
 
     @property
     def unexplained(self) -> list[tuple[int, int]]:
         """First and last row of each unexplained stretch between rows of the same lag."""
-        return [(a.end, b.begin - 1) for a, b in pairwise(self.runs) if a.end < b.begin and a.lag == b.lag]
+        return [(a.end, b.start - 1) for a, b in pairwise(self.runs) if a.end < b.start and a.lag == b.lag]
 
     def steps(self) -> list[tuple[int, int, int]]:
         """Return the steps: first and last possible row, and the samples lost (above 0) or duplicated (below 0)."""
         return [
-            (min(before.end, after.doubt[0]), max(after.begin, after.doubt[1]), after.lag - before.lag)
+            (min(before.end, after.doubt[0]), max(after.start, after.doubt[1]), after.lag - before.lag)
             for before, after in pairwise(self.runs)
             if after.lag != before.lag
         ]
@@ -131,8 +131,8 @@ class Track:
         """Return whether each row is explained, and the instants of those that are, from that of row 0 without lag."""
         explained, at = np.zeros(rows, bool), np.arange(rows)
         for run in self.runs:
-            explained[run.begin : run.end] = True
-            at[run.begin : run.end] += run.lag
+            explained[run.start : run.end] = True
+            at[run.start : run.end] += run.lag
         return explained, at[explained]
 
 
@@ -207,7 +207,7 @@ class _Walk:
         """Follow the record from a row with a known time error and slope of this error by row [samples]."""
         line, lag, length = np.array([row, late, pace]), 0, _CHUNK_ROWS
         history: list[tuple[float, float]] = []
-        begin = good_row = floor = row
+        start = good_row = floor = row
         doubt = row, row
         while row < self._rows:
             count = min(length, self._rows - row)
@@ -246,8 +246,8 @@ class _Walk:
                     if step is not None:
                         break
                 if not good:
-                    self._add_run(begin, row + a, lag, doubt)
-                    begin, doubt = row + b, (row + b, row + b)
+                    self._add_run(start, row + a, lag, doubt)
+                    start, doubt = row + b, (row + b, row + b)
                 elif shown:
                     middle, good_row = row + lag + 0.5 * (a + b), row + a
                     history = [*history[1 - _MAX_HISTORY :], (middle, line[1] + line[2] * (middle - line[0]) + error)]
@@ -262,16 +262,16 @@ class _Walk:
                 bad = row + edges[n]
                 back = max(floor, good_row if bad - good_row < _CHUNK_ROWS else bad)
                 earliest, row = self._locate_step(line, lag, moved, back, max(at, back + 1))
-                self._add_run(begin, row, lag, doubt)
-                begin, doubt, lag, floor = row, (earliest, row), lag + moved, row + 1
+                self._add_run(start, row, lag, doubt)
+                start, doubt, lag, floor = row, (earliest, row), lag + moved, row + 1
                 self._steps += 1
             line = _predict(history, line, row + lag)
-        self._add_run(begin, row, lag, doubt)
+        self._add_run(start, row, lag, doubt)
         self.end = row
 
-    def _add_run(self, begin: int, end: int, lag: int, doubt: tuple[int, int]) -> None:
-        if end > begin:
-            self.runs.append(RowRun(begin, end, lag, doubt))
+    def _add_run(self, start: int, end: int, lag: int, doubt: tuple[int, int]) -> None:
+        if end > start:
+            self.runs.append(RowRun(start, end, lag, doubt))
 
     def _find(self, y: np.ndarray, s: np.ndarray, ds: np.ndarray, edges: list[int], row: int) -> tuple[int, int] | None:
         """Return a step that explains the next block, this one, or the second next one: samples, and a row after it."""
@@ -352,21 +352,21 @@ class _Walk:
             ((each - self._first_s - one.late_s) / self._period_s - line[1] + line[2] * line[0]) / (1.0 + line[2])
             for each in one.stimulus.span_s
         )
-        for begin in range(math.ceil(low), math.floor(high) - count, _SEARCH_INSTANTS - count):
-            at = np.arange(begin, min(math.floor(high), begin + _SEARCH_INSTANTS))
+        for start in range(math.ceil(low), math.floor(high) - count, _SEARCH_INSTANTS - count):
+            at = np.arange(start, min(math.floor(high), start + _SEARCH_INSTANTS))
             place = at + line[1] + line[2] * (at - line[0])
             known = one.gain * one.stimulus(self._first_s + one.late_s + place * self._period_s)[0]
             sums = np.cumsum(np.concatenate([[0.0], known**2]))
             left = float(here @ here) - 2.0 * correlate(known, here, "valid", "fft") + sums[count:] - sums[:-count]
             near = np.flatnonzero(left <= left.min() + 2.0 * self._limit * one.noise**2)
-            moved = near + begin - row - lag
+            moved = near + start - row - lag
             best = min(best, (float(left.min()), int(moved[np.argmin(np.abs(moved))])))
         if best[0] > _MIN_EXPLAINED_PART * count * float(np.var(here)):
             return None
         return (best[1], row) if best[1] else None
 
     def _locate_step(self, line: np.ndarray, lag: int, moved: int, first: int, last: int) -> tuple[int, int]:
-        """Return the first and last row at which a step may begin."""
+        """Return the first and last row at which a step may start."""
         left = []
         for each in (lag, lag + moved):
             y, s, _ = self._evaluate(first, last, line, each)
@@ -476,12 +476,12 @@ def follow_record(
     back.follow(rows - middle, 0.0, pace)
     doubts = [*(run.doubt for run in back.runs), (rows - middle, rows - middle)]
     runs = [
-        RowRun(rows - run.end, rows - run.begin, -run.lag, (rows - doubt[1], rows - doubt[0]))
+        RowRun(rows - run.end, rows - run.start, -run.lag, (rows - doubt[1], rows - doubt[0]))
         for run, doubt in zip(back.runs, doubts[1:], strict=True)
     ][::-1]
     merged: list[RowRun] = []
     for run in [*runs, *onward.runs]:
-        if merged and (merged[-1].end, merged[-1].lag) == (run.begin, run.lag):
+        if merged and (merged[-1].end, merged[-1].lag) == (run.start, run.lag):
             merged[-1] = replace(merged[-1], end=run.end)
         else:
             merged.append(run)

@@ -32,7 +32,7 @@ class Stamps:
         self._stamped, self._size = shown or table.stamped, max(4, min(table.rows // _MAX_BATCHES, _MAX_BATCH_ROWS))
         self._back, self._last_s = 0, -math.inf
         self._means: list[np.ndarray] = []
-        self._squares, self._freedom = 0.0, 0
+        self._squares, self._dof = 0.0, 0
 
     def add_rows(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
         """Add rows to the batches.
@@ -49,11 +49,11 @@ class Stamps:
         self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) < 0.0))
         self._last_s = float(times_s[-1])
         apart = times_s[known] - first_s - since_s
-        for begin in range(0, len(apart) - size + 1, size):
-            late = apart[begin : begin + size]
-            self._means.append(np.array([since_s[begin : begin + size].mean(), late.mean()]))
+        for start in range(0, len(apart) - size + 1, size):
+            late = apart[start : start + size]
+            self._means.append(np.array([since_s[start : start + size].mean(), late.mean()]))
             self._squares += float(np.sum((late - late.mean()) ** 2))
-            self._freedom += size - 1
+            self._dof += size - 1
 
     def estimate_all(self, wall_s: float | None, *, apart_s: float = _SAME_CLOCK_S) -> dict[str, Interval | None]:
         """Return intervals of the offset at the first row [s], rate [ppm], jitter [s], backward steps, and latency [s].
@@ -74,12 +74,12 @@ class Stamps:
         whole = np.array(self._means[: len(self._means) // several * several])
         since, late = whole.reshape(-1, several, 2).mean(axis=1).T
         line = fit_line(since, late)
-        found["stamp rate"] = make_interval(line.slope, line.half[0], 1e6)
-        found["stamp offset"] = make_interval(line.at_zero, line.half[1])
+        found["stamp rate"] = make_interval(line.slope, line.half_widths[0], 1e6)
+        found["stamp offset"] = make_interval(line.at_zero, line.half_widths[1])
         if wall_s is not None and abs(late.mean() - wall_s) < apart_s:
             value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
             found["latency"] = make_interval(float(value), float(wide))
-        jitter_s, (low, high) = math.sqrt(self._squares / self._freedom), chi2_mean_ends(self._freedom)
+        jitter_s, (low, high) = math.sqrt(self._squares / self._dof), chi2_mean_ends(self._dof)
         found["stamp jitter"] = jitter_s, jitter_s / math.sqrt(high), jitter_s / math.sqrt(low)
         return found
 

@@ -17,7 +17,7 @@ from rig.channels.faults.defects import defects_shown
 
 PASS, FAIL, INCONCLUSIVE, NO_LIMIT = "pass", "fail", "inconclusive", "no limit"
 Verdict = Literal["pass", "fail", "inconclusive", "no limit"]
-Path_ = Literal["digital", "analogue"]
+SignalPath = Literal["digital", "analogue"]
 Interval = tuple[float, float, float]
 """Value, low and high end."""
 
@@ -39,10 +39,10 @@ class Quantity:
 
 _EXACT = "exact, row by row"
 _SANDWICH = "least squares, block sandwich of 64 blocks, Student's t"
-_FOLLOWED = "time error of each block, steps by whole samples by likelihood ratio"
-_SPLIT = "weighted least squares of squared residuals on squared slope, block sandwich, Student's t"
+_STEP_DETECTION = "time error of each block, steps by whole samples by likelihood ratio"
+_VARIANCE_SPLIT = "weighted least squares of squared residuals on squared slope, block sandwich, Student's t"
 _DURATION = "a longer run"
-_RICH = "a signal of many frequencies on every channel (test-prbs, 2 s)"
+_MULTI_FREQUENCY = "a signal of many frequencies on every channel (test-prbs, 2 s)"
 _WIDE_BAND = "a signal beyond the corner (test-chirp, test-prbs)"
 _SINE = "a sine near full scale on the channel (test-sine, 10 s)"
 _TONES = "two tones on the channel (test-two-tone, 10 s)"
@@ -55,8 +55,8 @@ _RECORDED = Quantity(
 )
 DIGITAL = {
     "recorded": _RECORDED,
-    "mapping": Quantity("1", "cross-correlation, then equal counts", _RICH),
-    "polarity": Quantity("1", "sign of the scale", _RICH),
+    "mapping": Quantity("1", "cross-correlation, then equal counts", _MULTI_FREQUENCY),
+    "polarity": Quantity("1", "sign of the scale", _MULTI_FREQUENCY),
     "scale": Quantity("ppm", "least squares, then every count equal", _DIGITS),
     "offset": Quantity("counts", "least squares, then every count equal", _DIGITS),
     "altered values": Quantity("1", _EXACT, _DURATION),
@@ -80,23 +80,23 @@ DIGITAL = {
 }
 ANALOGUE = {
     "recorded": _RECORDED,
-    "mapping": Quantity("1", "cross-correlation of all pairs", _RICH),
-    "polarity": Quantity("1", "cross-correlation of all pairs", _RICH),
+    "mapping": Quantity("1", "cross-correlation of all pairs", _MULTI_FREQUENCY),
+    "polarity": Quantity("1", "cross-correlation of all pairs", _MULTI_FREQUENCY),
     "gain": Quantity("ppm", _SANDWICH, _DURATION),
     "offset": Quantity("", _SANDWICH, _DURATION),
-    "skew": Quantity("ns", _SANDWICH, _RICH),
-    "start": Quantity("s", _SANDWICH, _RICH),
+    "skew": Quantity("ns", _SANDWICH, _MULTI_FREQUENCY),
+    "start": Quantity("s", _SANDWICH, _MULTI_FREQUENCY),
     "clock": Quantity("ppm", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"),
     "clock drift": Quantity(
         "ppm/s", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"
     ),
-    "lost samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
-    "doubled samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
+    "lost samples": Quantity("1", _STEP_DETECTION, "a signal above 100 Hz on every channel"),
+    "doubled samples": Quantity("1", _STEP_DETECTION, "a signal above 100 Hz on every channel"),
     "foreign rows": Quantity("1", "rows in unexplained blocks between explained ones", _DURATION),
     "judged part": Quantity("1", "rows explained over rows in the session", "a signal that does not repeat"),
     **{name: DIGITAL[name] for name in ("stamp rate", "stamp jitter", "stamps that go back")},
-    "noise": Quantity("", _SPLIT, _DURATION),
-    "jitter": Quantity("ns", _SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
+    "noise": Quantity("", _VARIANCE_SPLIT, _DURATION),
+    "jitter": Quantity("ns", _VARIANCE_SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
     "effective bits": Quantity("bit", "from the rms of the whole residual, log2(range / (rms sqrt 12))", _DURATION),
     "dynamic range": Quantity("dB", "from the noise, full-scale sine over it", _DURATION),
     "corner": Quantity("Hz", "least squares with a Butterworth low-pass, else cross spectra", _WIDE_BAND),
@@ -111,7 +111,7 @@ ANALOGUE = {
     "IMD": Quantity("dB", "products of second and third order over two tones, least squares, delta method", _TONES),
     "INL": Quantity("ppm", "transfer curve of 64 straight pieces, simultaneous interval, of the range", _RAMP),
     "DNL": Quantity("LSB", "code density of a ramp, simultaneous interval", f"{_RAMP}, longer for more samples"),
-    "crosstalk": Quantity("dB", f"worst of the other channels, in volts, {_SANDWICH}", _RICH),
+    "crosstalk": Quantity("dB", f"worst of the other channels, in volts, {_SANDWICH}", _MULTI_FREQUENCY),
     "rise time": Quantity("s", "10 to 90 % of the mean step response", _STEPS),
     "overshoot": Quantity("%", "largest value of the mean step response, simultaneous interval", _STEPS),
     "settling time": Quantity("s", "from 50 % of the mean step response, simultaneous interval", _STEPS),
@@ -200,7 +200,7 @@ def _is_outside(value: float, low: float, high: float, limit: Bounds, *, rms: bo
 
 
 def judge_row(
-    path: Path_, quantity: str, channel: str, estimate: Interval | None, *, unit: str = "",
+    path: SignalPath, quantity: str, channel: str, estimate: Interval | None, *, unit: str = "",
     limit: Bounds | None = None, note: str = "",
 ) -> ScoreRow:  # fmt: skip
     """Return a row with its verdict: the whole interval decides, and one that crosses a limit is inconclusive.
@@ -231,7 +231,7 @@ def judge_row(
     return ScoreRow(quantity, channel, value, low, high, about.unit or unit, about.method, limit, verdict, run, note)
 
 
-def text_row(path: Path_, quantity: str, channel: str, value: str, verdict: Verdict, note: str) -> ScoreRow:
+def text_row(path: SignalPath, quantity: str, channel: str, value: str, verdict: Verdict, note: str) -> ScoreRow:
     """Return a row with a text as its value, and a given verdict."""
     about = QUANTITIES[path][quantity]
     run = about.run if verdict == INCONCLUSIVE else ""
@@ -246,22 +246,22 @@ class Scorecard:
         title: Title.
         path: Digital or analogue.
         limits: Title of the limits.
-        asked: Function that returns the limits of a path's quantity, for a channel of the session's table.
+        find_limit: Function that returns the limits of a path's quantity, for a channel of the session's table.
         rows: The rows.
         remarks: Assumptions.
-        doubts: Reasons why the record shows too little for a pass; the outcome is then inconclusive unless a quantity
-            fails.
+        evidence_gaps: Reasons why the record shows too little for a pass; the outcome is then inconclusive unless a
+            quantity fails.
         pictures: Data for plots, by kind and channel.
         runs: Row numbers by event, as pairs of first and last.
     """
 
     title: str
-    path: Path_
+    path: SignalPath
     limits: str
-    asked: Callable[..., Bounds | None]
+    find_limit: Callable[..., Bounds | None]
     rows: list[ScoreRow] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
+    evidence_gaps: list[str] = field(default_factory=list)
     pictures: dict[str, Any] = field(default_factory=dict)
     runs: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
 
@@ -270,14 +270,14 @@ class Scorecard:
         **inputs: Any,
     ) -> None:  # fmt: skip
         """Judge an estimate by the limit for the session's channel `of` and for further inputs, and add the row."""
-        limit = self.asked(self.path, quantity, of, **inputs)
+        limit = self.find_limit(self.path, quantity, of, **inputs)
         self.rows.append(judge_row(self.path, quantity, channel, estimate, unit=unit, limit=limit, note=note))
 
     @property
     def outcome(self) -> Outcome:
         """Fail if a quantity fails; pass if one passes without any doubt; otherwise inconclusive."""
         verdicts = {row.verdict for row in self.rows}
-        return Outcome.judge(failed=FAIL in verdicts, has_evidence=PASS in verdicts and not self.doubts)
+        return Outcome.judge(failed=FAIL in verdicts, has_evidence=PASS in verdicts and not self.evidence_gaps)
 
     @property
     def verdict_line(self) -> str:
@@ -288,8 +288,8 @@ class Scorecard:
         parts += [f"{counts[INCONCLUSIVE]} inconclusive, {counts[NO_LIMIT]} without a limit"]
         reason = ""
         if self.outcome is Outcome.INCONCLUSIVE:
-            more = f"; and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
-            reason = f"; {self.doubts[0]}{more}" if self.doubts else "; no quantity passes"
+            more = f"; and {len(self.evidence_gaps) - 1} more" if self.evidence_gaps[1:] else ""
+            reason = f"; {self.evidence_gaps[0]}{more}" if self.evidence_gaps else "; no quantity passes"
         return f"{self.path} path: {self.outcome}: {', '.join(parts)}{reason}"
 
     @property
@@ -326,7 +326,7 @@ class Scorecard:
             entry |= {"value": row.value, "low": row.low, "high": row.high}
         return replace_nonfinite({
             "title": self.title, "path": self.path, "outcome": self.outcome.value, "good": self.outcome is Outcome.PASS,
-            "verdict": self.verdict_line, "doubts": self.doubts, "limits": self.limits, "rows": rows,
+            "verdict": self.verdict_line, "doubts": self.evidence_gaps, "limits": self.limits, "rows": rows,
             "defects": self.defects, "remarks": self.remarks, "runs": self.runs,
         })  # fmt: skip
 
@@ -372,7 +372,7 @@ def _outcome_case(card: Scorecard) -> junit.JunitCase:
     result: dict[Outcome, junit.Outcome] = {
         Outcome.PASS: "passed", Outcome.FAIL: "failure", Outcome.INCONCLUSIVE: "inconclusive",
     }  # fmt: skip
-    lines = "\n".join(card.doubts)
+    lines = "\n".join(card.evidence_gaps)
     return junit.JunitCase(f"score.{card.path}", "outcome", result[card.outcome], card.verdict_line, lines)
 
 

@@ -44,10 +44,10 @@ def find_crosstalk(
     if own_part.min() < _MIN_SEPARATE_PART:
         return int(own_part.argmin()), None
     parts, *moved = solve(matrix, np.column_stack([left, *map(detrend, errors)])).T
-    covariance, freedom = sandwich(matrix, left - matrix @ parts)
+    covariance, dof = sandwich(matrix, left - matrix @ parts)
     held, own_size = slice(len(sources)), sizes[len(sources)]
     sizes, parts = sizes[held], np.abs(parts[held] / sizes[held])
-    value, low, high = bound_maximum(parts, np.sqrt(np.diag(covariance)[held]) / sizes, freedom[held])
+    value, low, high = bound_maximum(parts, np.sqrt(np.diag(covariance)[held]) / sizes, dof[held])
     # Noise of the channel's own signal in the residual correlates with the part of a source that differs from it.
     likest = np.abs(likeness[held, len(sources)]) * sizes / own_size
     wrong = _NOISE_FACTOR * noise**2 * likest / (own_part * sizes**2)

@@ -84,8 +84,8 @@ def _fit_powers(
     rest = (fast - matrix @ parts) * root
     both = np.column_stack([matrix * root[:, None], slow := wander_columns(rest)])
     rest = rest - slow @ (slow.T @ rest) * 2.0 / len(rest)
-    covariance, freedom = (found[..., : len(parts)] for found in sandwich(both, rest, even=True))
-    half = student(freedom) * np.sqrt(np.diag(covariance))
+    covariance, dof = (found[..., : len(parts)] for found in sandwich(both, rest, even=True))
+    half = student(dof) * np.sqrt(np.diag(covariance))
     parts[0] += np.mean(wander)
     # Few independent squares have a skewed chi-squared distribution: the ends are at equal ratios.
     ratio = np.exp(half / np.maximum(parts, 1e-300), where=half < _SKEW * parts, out=np.full(len(parts), np.nan))

@@ -120,6 +120,4 @@ def widen_intervals(found: Waveform, converters: Sequence[Converter]) -> Wavefor
     late = [slope, slope * since, slope * 0.5 * (since**2 - found.half_s**2 / 3.0)]
     columns = np.column_stack([known, np.ones(len(since)), *(found.gain * each for each in late)])
     moved = solve(columns, errors.T)
-    return replace(
-        found, covariance=found.covariance + np.diag((np.abs(moved).max(axis=1) / student(found.freedom)) ** 2)
-    )
+    return replace(found, covariance=found.covariance + np.diag((np.abs(moved).max(axis=1) / student(found.dof)) ** 2))

@@ -36,7 +36,7 @@ class Scale:
         each, zero: Value per count, and value of count 0 [unit of the file].
         what: Counts, the channel's unit, volts, or fitted.
         gain_ppm, zero_counts: Errors of the two.
-        turned: Whether the sign is inverted.
+        inverted: Whether the sign is inverted.
         known: Whether some rows have confirmed it; if not, it follows from the file's unit.
         bits, lost_bits: Bits of the DAQ's converter, and number of the rig's lowest bits that it leaves out.
         rounding: Rounding of the left-out bits: down, nearest (halves up), nearest even, or full scale
@@ -48,7 +48,7 @@ class Scale:
     what: str
     gain_ppm: float = 0.0
     zero_counts: float = 0.0
-    turned: bool = False
+    inverted: bool = False
     known: bool = True
     bits: int = 0
     lost_bits: int = 0
@@ -159,12 +159,12 @@ def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates
         return (
             near
             if sign > 0.0
-            else replace(near, each=-near.each, zero=-near.zero, what=f"fitted, beside {near.what}", turned=True)
+            else replace(near, each=-near.each, zero=-near.zero, what=f"fitted, beside {near.what}", inverted=True)
         )
     each, at_zero = sign * near.each * (1.0 + gain), sign * ((1.0 + gain) * near.zero + zero * near.each)
     return replace(
         near, each=each, zero=at_zero, what=f"fitted, beside {near.what}", gain_ppm=1e6 * gain, zero_counts=zero,
-        turned=sign < 0.0,
+        inverted=sign < 0.0,
     )  # fmt: skip
 
 

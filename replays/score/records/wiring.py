@@ -13,9 +13,9 @@ from replays.estimate.spectra import correlation, spectrum
 
 _LIMIT, _CHANCE = 0.2, 6.0
 """Smallest correlation of a found signal: the larger of `_LIMIT`, and `_CHANCE` over the square root of its samples."""
-_EQUAL_PART = 0.95
+_CANDIDATE_RATIO = 0.95
 """Ratio to the best correlation above which another channel, or lag, remains a candidate."""
-_CLEAR_PART = 0.98
+_TIE_RATIO = 0.98
 """Ratio to the best correlation above which two rank equally; also the correlation that needs no second search."""
 _MIN_POWER = 1e-4
 """Power of a stretch over that of the loudest one, above which it is compared in full: the ringing after an impact has
@@ -28,7 +28,7 @@ _MAX_SAMPLES = 1 << 17
 """Largest number of samples of a signal that are correlated."""
 _PART_S = 30.0
 """Part of a session that is searched at a time [s]; parts overlap by a stretch."""
-_MEDIAN_LIKENESS = 0.7
+_MIN_MEDIAN_CORRELATION = 0.7
 """Median correlation of the signals above which no other stretch is tried."""
 _GRID_S = 0.01
 """Grid of the search for the busiest stretch [s]."""
@@ -45,19 +45,19 @@ class Wire:
         polarity: 1 or -1.
         likeness: Correlation, 0 to 1.
         rivals: Other channels with an equal correlation.
-        turned: Whether the opposite polarity at another time has an equal correlation, as for a sine.
-        late_s: Time in the session less time in the recording, common to all signals [s].
-        within_s: Stretch of the recording in which `late_s` was found [s].
-        others_s: Other possible values of `late_s`, for nearly periodic signals [s].
-        own_s: `late_s` of this signal alone, which may differ slightly [s].
+        ambiguous: Whether the opposite polarity at another time has an equal correlation, as for a sine.
+        offset_s: Time in the session less time in the recording, common to all signals [s].
+        within_s: Stretch of the recording in which `offset_s` was found [s].
+        others_s: Other possible values of `offset_s`, for nearly periodic signals [s].
+        own_s: `offset_s` of this signal alone, which may differ slightly [s].
     """
 
     channel: str
     polarity: int
     likeness: float
     rivals: tuple[str, ...]
-    turned: bool
-    late_s: float
+    ambiguous: bool
+    offset_s: float
     within_s: tuple[float, float]
     others_s: tuple[float, ...]
     own_s: float
@@ -90,13 +90,13 @@ def find_wires(
                 if rows[name].start < len(values)
             }
             wires = {name: _shift(wire, float(part_s)) for name, wire in _find(recorded, part, from_s, long).items()}
-            if all(wire.likeness > _CLEAR_PART and not wire.others_s for wire in wires.values()):
+            if all(wire.likeness > _TIE_RATIO and not wire.others_s for wire in wires.values()):
                 return wires
             if _sum_likeness(wires) > _sum_likeness(best):
                 best, found_s, here = wires, from_s, (float(part_s), part)
-            if np.median([wire.likeness for wire in wires.values()]) > _CLEAR_PART:
+            if np.median([wire.likeness for wire in wires.values()]) > _TIE_RATIO:
                 break
-        if np.median([wire.likeness for wire in best.values()]) > _MEDIAN_LIKENESS:
+        if np.median([wire.likeness for wire in best.values()]) > _MIN_MEDIAN_CORRELATION:
             break
     wires = best
     more = _find(recorded, here[1], _busiest_s(recorded, found_s, short), short)
@@ -109,8 +109,8 @@ def find_wires(
         # Clocks that differ blur fast signals over the long stretch, and a slower channel then correlates better.
         of = max(wire, other, key=lambda each: each.likeness)
         found[name] = replace(
-            of, late_s=wire.late_s, own_s=wire.own_s, within_s=wire.within_s,
-            others_s=(other.late_s, *other.others_s, *wire.others_s),
+            of, offset_s=wire.offset_s, own_s=wire.own_s, within_s=wire.within_s,
+            others_s=(other.offset_s, *other.others_s, *wire.others_s),
         )  # fmt: skip
     return found
 
@@ -122,7 +122,7 @@ def _sum_likeness(wires: Mapping[str, Wire]) -> float:
 def _shift(wire: Wire, shift_s: float) -> Wire:
     """Convert the times of a wire, found in a part of the session that starts at `shift_s`, to those of the session."""
     others_s = tuple(each + shift_s for each in wire.others_s)
-    return replace(wire, late_s=wire.late_s + shift_s, own_s=wire.own_s + shift_s, others_s=others_s)
+    return replace(wire, offset_s=wire.offset_s + shift_s, own_s=wire.own_s + shift_s, others_s=others_s)
 
 
 def _busiest_s(recorded: Mapping[str, tuple[np.ndarray, float]], from_s: float, taken_s: float) -> float:
@@ -163,17 +163,17 @@ def _find(
     best: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     ends: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for name, here in taken.items():
-        length = lengths[len(here)] / math.sqrt(_ratio(recorded[name][1], rate))
+        length = lengths[len(here)] / math.sqrt(_upsampling_factor(recorded[name][1], rate))
         curve = _correlate(here, behind, there, length)
         alike = np.abs(curve).max(axis=0)
         own = np.abs(curve[names.index(name)]) if name in names else alike
-        best[name] = alike, own, curve.max(axis=0) >= _CLEAR_PART * alike
+        best[name] = alike, own, curve.max(axis=0) >= _TIE_RATIO * alike
         ends[name] = curve.min(axis=1), curve.max(axis=1)
     lags = _find_common_lags(list(best.values()), behind + round(from_s * rate))
     lag = lags[0]
     padded = np.pad(even, ((0, 0), (behind, max(map(len, taken.values())) + round(_WIDE_S * rate) + _REACH)))
     for name, here in taken.items():
-        length = lengths[len(here)] / math.sqrt(_ratio(recorded[name][1], rate))
+        length = lengths[len(here)] / math.sqrt(_upsampling_factor(recorded[name][1], rate))
         for apart in (_REACH, round(_WIDE_S * rate)):
             first = max(0, min(lag, length.shape[1] - 1) - apart)  # nothing was found, late in the recording
             about = range(first, min(lag + apart + 1, length.shape[1]))
@@ -184,20 +184,20 @@ def _find(
             if amounts.max() > 0.5:
                 break
         k = int(np.argmax(amounts))
-        rivals = tuple(names[j] for j in np.flatnonzero(amounts >= _EQUAL_PART * amounts[k]) if j != k)
+        rivals = tuple(names[j] for j in np.flatnonzero(amounts >= _CANDIDATE_RATIO * amounts[k]) if j != k)
         if name in rivals and name in names:  # the name decides between equals
             rivals = (*(each for each in rivals if each != name), names[k])
             k = names.index(name)
         at = int(np.argmax(np.abs(near[k])))
         peak = near[k][at]
         polarity = 1 if peak >= 0.0 else -1
-        turned = max(-polarity * end[k] for end in ends[name]) > 0.9 * amounts[k]
-        known = amounts[k] > max(_LIMIT, _CHANCE / math.sqrt(len(here) / _ratio(recorded[name][1], rate)))
-        late_s = (lag - behind) / rate - from_s
+        ambiguous = max(-polarity * end[k] for end in ends[name]) > 0.9 * amounts[k]
+        known = amounts[k] > max(_LIMIT, _CHANCE / math.sqrt(len(here) / _upsampling_factor(recorded[name][1], rate)))
+        offset_s = (lag - behind) / rate - from_s
         found[name] = Wire(
-            names[k] if known else "", polarity, float(amounts[k]), rivals if known else (), bool(turned),
-            late_s, (from_s, from_s + taken_s), tuple((each - behind) / rate - from_s for each in lags[1:]),
-            late_s if turned else late_s + (first + at - lag) / rate,
+            names[k] if known else "", polarity, float(amounts[k]), rivals if known else (), bool(ambiguous),
+            offset_s, (from_s, from_s + taken_s), tuple((each - behind) / rate - from_s for each in lags[1:]),
+            offset_s if ambiguous else offset_s + (first + at - lag) / rate,
         )  # fmt: skip
     # Among equally similar channels, prefer one whose name no other signal has.
     taken = {name for name, wire in found.items() if wire.channel == name}
@@ -213,7 +213,7 @@ def _resample(values: np.ndarray, rate: float, wanted: float, seconds: float) ->
     values = np.asarray(values[: math.ceil(seconds * rate) + 2])
     held = np.nan_to_num(values, nan=float(np.nanmean(values)) if np.isfinite(values).any() else 0.0)
     rows = max(2, min(math.floor(seconds * wanted), math.floor((len(held) - 1) / rate * wanted) + 1))
-    if (step := _ratio(rate, wanted)) > 1:
+    if (step := _upsampling_factor(rate, wanted)) > 1:
         even = np.zeros(rows)
         part = held[: -(-rows // step)]
         even[::step] = part - part.mean()
@@ -221,7 +221,7 @@ def _resample(values: np.ndarray, rate: float, wanted: float, seconds: float) ->
     return np.interp(np.arange(rows) * (rate / wanted), np.arange(len(held)), held)
 
 
-def _ratio(rate: float, wanted: float) -> int:
+def _upsampling_factor(rate: float, wanted: float) -> int:
     """Return how many samples at the wanted rate equal one at `rate`, if a whole number; otherwise 1."""
     step = round(wanted / rate)
     return step if step > 1 and abs(step * rate / wanted - 1.0) < 1e-9 else 1
@@ -265,7 +265,7 @@ def _find_common_lags(curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], z
 
     A sine has equal peaks in every period, and sequences with different starts have several. Of peaks close to the
     best one, the first is that at which most signals match the channel of their name, then that at which most have
-    the polarity of the most similar channel, then one within `_CLEAR_PART` of the best, then the nearest to zero lag.
+    the polarity of the most similar channel, then one within `_TIE_RATIO` of the best, then the nearest to zero lag.
 
     Args:
         curves: By lag, each signal's correlation with the most similar channel and with that of its name, and
@@ -276,13 +276,13 @@ def _find_common_lags(curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], z
     if not clear:
         return [zero]
     curve = np.mean(clear, axis=0)
-    high = curve >= _EQUAL_PART * curve.max()
+    high = curve >= _CANDIDATE_RATIO * curve.max()
     peaks = [low + int(np.argmax(curve[low:up])) for low, up in find_true_runs(high)]
 
     def rank(at: int) -> tuple[int, int, bool, int]:
-        named = sum(bool(own[at] >= _CLEAR_PART * alike[at]) for alike, own, _ in curves)
+        named = sum(bool(own[at] >= _TIE_RATIO * alike[at]) for alike, own, _ in curves)
         upright = sum(bool(each[at]) for *_, each in curves)
-        return named, upright, bool(curve[at] >= _CLEAR_PART * curve.max()), -abs(at - zero)
+        return named, upright, bool(curve[at] >= _TIE_RATIO * curve.max()), -abs(at - zero)
 
     first = max(peaks, key=rank)
     return [first, *sorted(set(peaks) - {first}, key=lambda at: -curve[at])[:_MAX_LAGS]]

@@ -42,7 +42,7 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
             "unlike": ladder.unlike.candidate.method,
             "model": ladder.reference.candidate.model,
         },
-        "outcome": ladder.reference.ending.word if ladder.reference.ending else None,
+        "outcome": ladder.reference.ending.outcome if ladder.reference.ending else None,
         "savings": {level: _digits(part) for level, part in ladder.savings.items()},
         "steps": [
             {
@@ -128,7 +128,7 @@ def _run(measured: Measurement, simulated_s: float) -> dict[str, Any]:
         "engine": measured.candidate.method,
         "model": measured.candidate.model,
         "values": {name: _number(value) for name, value in measured.values.items()},
-        "outcome": measured.ending.word if measured.ending else None,
+        "outcome": measured.ending.outcome if measured.ending else None,
         "contact_share": measured.ending.contact_share if measured.ending else None,
         "cpu_s": _number(measured.cpu_s),
         "cpu_least_s": _number(measured.spread_s[0]),

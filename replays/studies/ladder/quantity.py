@@ -78,7 +78,7 @@ class Ending(NamedTuple):
     """Part of the settled phase in which it rolls [1]."""
 
     @property
-    def word(self) -> str:
+    def outcome(self) -> str:
         """Outcome in words: flight, bounces, partial rub, resting, or rolling or sliding whirl of either direction."""
         if not self.touches or self.contact_share <= MIN_CONTACT_SHARE:
             return "bounces" if self.touches else "flight"

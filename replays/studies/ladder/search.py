@@ -263,7 +263,7 @@ class _Reference(NamedTuple):
         alike = _have_same_outcome(measured, self.reference)
         passes = not measured.failure and errors.largest_error(self.allowed) <= 1.0 and alike
         if not alike and measured.ending is not None:
-            note = f"another outcome: {measured.ending.word}"
+            note = f"another outcome: {measured.ending.outcome}"
         return Rung(stage, label, measured, errors, passes, cost=cost, note=measured.failure or note)
 
 
@@ -287,7 +287,7 @@ def _run_reference(work: _Search) -> _Reference:
             raise InputError("scene", must, measured.candidate.method)
     check_reads(work.scene, reference)
     if not _have_same_outcome(reference, unlike):
-        endings = [measured.ending.word for measured in (reference, unlike) if measured.ending]
+        endings = [measured.ending.outcome for measured in (reference, unlike) if measured.ending]
         must = f"one with the same outcome on two accurate engines ({' and '.join(endings)} depend on chance)"
         raise InputError("scene", must, work.scene.name)
     standard = _Reference(full, reference, unlike, {}, {})

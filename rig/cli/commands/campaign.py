@@ -74,7 +74,7 @@ def campaign(
         raise InputError("--jobs", "1 with --url, as the cases share one rig", jobs)
     if output is not None:
         check_folder(output, field="--output")
-    files = _checked(files, against, replay, device, limit or ())
+    files = _check_files(files, against, replay, device, limit or ())
     plugin_options = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
     plugin_options["--rig-device"] = device
     options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
@@ -95,7 +95,7 @@ def _list() -> None:
     echo(f"files in {FOLDER}")
 
 
-def _checked(
+def _check_files(
     files: list[str], against: Path | None, replay: Path | None, device: str | None, limits: Sequence[str]
 ) -> list[str]:
     """Return the paths of the files; raise an error for wrong files before anything runs."""

@@ -48,7 +48,7 @@ def cut(
             force=force,
             on_progress=lambda done: report.part(done, f"writing {output}"),
         )
-    for line in result.short:
+    for line in result.missing_rows:
         echo(f"rig: {line}", err=True)
     counts = result.counts
     echo(

@@ -83,11 +83,10 @@ class FitRequest:
         keys = [key for part in self.fit for key in split_names(part)]
         experiment, along = self._experiment(recording), dict[str, tuple[float, float] | None]()
         known = parse_pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
-        priors = {key: _two("prior", text, "+-") for key, text in known.items()}
+        priors = {key: _parse_pair("prior", text, "+-") for key, text in known.items()}
         starts = {key: _number("start", text) for key, text in parse_pairs("--start", self.start, "KEY=VALUE").items()}
-        bounds = {
-            key: _two("bounds", text, ":") for key, text in parse_pairs("--bounds", self.bounds, "KEY=LOW:HIGH").items()
-        }
+        limits = parse_pairs("--bounds", self.bounds, "KEY=LOW:HIGH")
+        bounds = {key: _parse_pair("bounds", text, ":") for key, text in limits.items()}
         given: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": split_names(self.channels) or None}
         if is_imported(recording) and not exact:
             if first_command_s(experiment) > 0.0:
@@ -215,7 +214,7 @@ def _number(option: str, text: str) -> float:
         raise InputError(option, "a number", text) from None
 
 
-def _two(option: str, text: str, between: str) -> tuple[float, float]:
+def _parse_pair(option: str, text: str, between: str) -> tuple[float, float]:
     from rig.base.errors import InputError
 
     first, sign, second = text.partition(between)

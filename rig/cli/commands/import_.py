@@ -168,16 +168,16 @@ _SPARK = 12
 
 
 def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
-    table = new_table("", "signal", "course", "becomes", "sure", "why", wrapped=("signal", "why"), spare=("course",))
+    headings = ("signal", "course", "becomes", "confidence", "reason")
+    table = new_table("", *headings, wrapped=("signal", "reason"), spare=("course",))
     for guess in guesses:
         unit = f" [{guess.entry.unit}]" if guess.entry.unit else ""
         where = f"{guess.entry.group} " if len({each.entry.group for each in guesses}) > 1 else ""
         reason = guess.why if guess.channel else "not a channel of the rig; kept as a new channel"
-        course = guess.features.sparkline(_SPARK)
         style = "" if guess.channel and guess.confidence != "ask" else "yellow"
         table.add_row(
             f"{where}{guess.entry.name}{unit}",
-            course,
+            guess.features.sparkline(_SPARK),
             guess.channel or "-",
             guess.confidence if guess.channel else "-",
             reason,

@@ -70,6 +70,6 @@ def _recover(file: Path, new: Path, *, force: bool) -> bool:
         + (f"; {result.damaged} damaged record{'s' * (result.damaged > 1)} skipped" if result.damaged else "")
         + "".join(f"; {text}: no checksum covers them" for text in result.unchecked)
         + (f"; {lost} {'row is' if lost == 1 else 'rows are'} missing in it" if lost else "")
-        + "".join(f"; {text}" for text in result.short)
+        + "".join(f"; {text}" for text in result.missing_rows)
     )
-    return not (result.damaged or lost or result.short)
+    return not (result.damaged or lost or result.missing_rows)

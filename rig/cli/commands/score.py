@@ -176,7 +176,7 @@ def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
             console.print(make_printable(f"{quantity:<22}{cells}".rstrip()))
     if lines:
         console.print("+ pass, X fail, ? inconclusive\n")
-    for line in (*card.doubts[1:], *card.findings):
+    for line in (*card.evidence_gaps[1:], *card.findings):
         console.print(make_printable(line))
     table = new_table(
         "", "quantity", "channel", ">value", "95 %", "unit", "limit", "verdict", "note", "to show it", "source",

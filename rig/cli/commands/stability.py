@@ -206,7 +206,7 @@ def sweep_table(found: dict[str, Any], seed: int) -> Table:
         within = "-" if result["within"] is None else f"{result['within']:.0%}"
         faults = [str(len(result[kind])) for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd")]
         speeds = ["-" if speed is None else f"{speed:.3g}" for speed in (result["slowest"], result["median_speed"])]
-        table.add_row(name, str(result["told"]), *errors, within, *faults, *speeds)
+        table.add_row(name, str(result["compared"]), *errors, within, *faults, *speeds)
     return table
 
 

@@ -30,7 +30,7 @@ from replays.recordings.validation.explanations.explanation import (
     vector,
 )
 from replays.recordings.validation.explanations.faults import MIN_PART, Clock, are_cause, select_channels, sensor_faults
-from replays.recordings.validation.explanations.numbers import numbers_of_the_model
+from replays.recordings.validation.explanations.model_parameters import explain_by_parameters
 from replays.recordings.validation.explanations.signals import SignalFault
 from replays.recordings.validation.explanations.single_channels import make_signal_faults
 from replays.recordings.validation.trajectory import scaled
@@ -206,7 +206,7 @@ def explain_log(
     trigger = any(one.name == "hammer delay" for one in sensors)
     far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
     cured = are_cause(sensors, parts)
-    numbers = numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=end_s) if sensors or far else []
+    numbers = explain_by_parameters(parts, nominal, others, tuned, rules, end_s=end_s) if sensors or far else []
     # A number that explains no more than the sensors do is not reported with them.
     numbers = [one for one in numbers if one.at_floor or one.explained > MIN_PART]
     told_s = min((one.to_s for one in numbers), default=end_s)

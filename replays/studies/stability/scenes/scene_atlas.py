@@ -30,14 +30,14 @@ from rig.run.scenes import Scene
 OUTCOMES = {
     "right": (GREEN, "right: error at most 0.01"),
     "near": ("#A6D854", "near: at most 0.1"),
-    "told": ("#F0C000", "wrong, and warns"),
+    "warned": ("#F0C000", "wrong, and warns"),
     "silent": (RED, "wrong without a warning"),
     "gained": ("#7A0177", "wrong without a warning, and energy gained"),
     "ended": ("0.1", "gives up, or takes more than 20 s"),
     "refused": ("0.88", "cannot take the friction law"),
 }
 """Kinds of outcome with colour and description."""
-HATCHES = {"told": "..", "silent": "///", "gained": "xxx"}
+HATCHES = {"warned": "..", "silent": "///", "gained": "xxx"}
 """Hatches that mark wrong runs in print."""
 _LIMIT_S = 20.0
 """Processor time per run [s]."""
@@ -136,7 +136,7 @@ def _peer(one: Competitor, setting: Setting, name: str, exact: np.ndarray) -> tu
 def _kind(error: float, *, warns: bool, gained: float) -> str:
     if not math.isfinite(error) or error > WRONG_ERROR:
         silent = "gained" if gained > _GAINED else "silent"
-        return "told" if warns else silent
+        return "warned" if warns else silent
     return "right" if error <= AGREE_ERROR else "near"
 
 

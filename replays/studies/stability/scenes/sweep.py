@@ -130,7 +130,7 @@ def _engine(runs: list[tuple[Row, Row]]) -> Row:
             refused[one["message"]] = refused.get(one["message"], 0) + 1
     return {
         "runs": len(ran),
-        "told": len(compared),
+        "compared": len(compared),
         "asked": max((one["asked"] for _, one in runs), default=None),
         "error": _quantiles([one["error"] for _, one in compared]),
         "calm": len(calm),

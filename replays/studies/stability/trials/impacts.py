@@ -99,7 +99,7 @@ def grazing_cases(engine: str, quick: bool) -> Iterator[Cell]:
         for speed, error in zip(ONSET_SPEEDS, errors, strict=True)
         if abs(speed / limit - 1.0) > 1e-3
     )
-    yield Cell("floor not told", float(wrong), 0.0, "a floored v0 is counted, no other")
+    yield Cell("floor not reported", float(wrong), 0.0, "a floored v0 is counted, no other")
 
 
 def drop_cases(engine: str, quick: bool) -> Iterator[Cell]:

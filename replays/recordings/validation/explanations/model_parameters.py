@@ -18,11 +18,11 @@ from replays.recordings.validation.explanations.explanation import Explanation, 
 from replays.recordings.validation.trajectory import floors
 from rig.base.errors import InputError
 
-_SHORT_PART = 0.6
+_RETRY_FRACTION = 0.6
 """Fraction of the time after the hammer pulse to which a repeated search is limited."""
 
 
-def numbers_of_the_model(
+def explain_by_parameters(
     parts: dict[str, Measured],
     nominal: Prediction,
     others: Sequence[Prediction],
@@ -47,7 +47,7 @@ def numbers_of_the_model(
         shorten: Whether to search again on a shorter part if nothing is found.
     """
     along = tuple(tuned.values)
-    candidates = [one for one in rules.candidates if _has_numbers(tuned, one) and not set(one.keys) & set(along)]
+    candidates = [one for one in rules.candidates if _has_float_values(tuned, one) and not set(one.keys) & set(along)]
     keys = (*along, *dict.fromkeys(key for one in candidates for key in one.keys))
     kept = {name: part.select_until(end_s) for name, part in parts.items()}
     predictor = Predictor(tuned.baseline, keys, kept, about_s=tuned.about_s)
@@ -96,8 +96,8 @@ def numbers_of_the_model(
     hit_s = first_command_s(tuned.baseline)
     if not found and shorten and hit_s < end_s:
         # No candidate keeps the fitted values within their priors: across impacts the linearisation is not valid.
-        sooner_s = hit_s + _SHORT_PART * (end_s - hit_s)
-        return numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=sooner_s, shorten=False)
+        sooner_s = hit_s + _RETRY_FRACTION * (end_s - hit_s)
+        return explain_by_parameters(parts, nominal, others, tuned, rules, end_s=sooner_s, shorten=False)
     return found
 
 
@@ -116,7 +116,7 @@ def _find_sizes(experiment: Experiment, candidate: Candidate) -> tuple[bool, lis
     return relative, values if relative else [1.0] * len(values)
 
 
-def _has_numbers(tuned: Tuned, candidate: Candidate) -> bool:
+def _has_float_values(tuned: Tuned, candidate: Candidate) -> bool:
     try:
         return all(isinstance(get_value(tuned.baseline, key), float) for key in candidate.keys)
     except InputError:

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from replays.score.alignment.one_begin import MIN_LIKENESS, MIN_ROWS, Alignment, RowSource, find_busiest, follow
 from replays.score.alignment.repeats import find_repeats
+from replays.score.alignment.single_start import MIN_LIKENESS, MIN_ROWS, Alignment, RowSource, find_busiest, follow
 from replays.score.records.stimulus import Exact
 from replays.score.waveform import Waveform, fit_stretch, fit_waveform
 
@@ -30,7 +30,7 @@ _MAX_COMPARED = 3
 _MAX_SEARCHED = 2
 """Number of these signals by which a start is selected for following."""
 MAX_FOLLOWED = 4
-"""Begins that are followed with all channels: the nearest ones, including those half a period later."""
+"""Starts that are followed with all channels: the nearest ones, including those half a period later."""
 _MIN_POWER_RATIO = 1.05
 """Ratio of residual powers below which starts are never distinguished."""
 _DEVIATIONS = 6.0
@@ -49,7 +49,7 @@ _STRETCHES = 6
 """Parts of a record, each with one stretch that is compared before the record is followed."""
 
 
-class Begins:
+class Candidates:
     """Candidate starts of a table, compared by the residual power of some signals in blocks of rows.
 
     Rows outside the session are not compared. Where a signal repeats, starts that explain their rows equally well are
@@ -85,7 +85,7 @@ class Begins:
         found = np.full((min(_MAX_SEARCHED, len(self._compared)), len(self._parts)), np.nan)
         for n, part in np.ndindex(found.shape):
             one = self._compared[n]
-            fit = fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, self._parts[part])
+            fit = fit_stretch(one.values, one.times_s, one.stimulus, one.offset_s + shift_s, self._parts[part])
             if fit is not None:
                 found[n, part] = max(float(np.var(fit.residual)), 1e-300)
         return found
@@ -130,14 +130,14 @@ class Begins:
         least, excess = min(map(self.penalty, kept), default=0), self._stretch_excess()
         kept += [
             each for _, each in self._fits
-            if excess[self._shifts.index(each.begin_s)] < math.log(_MIN_POWER_RATIO)
+            if excess[self._shifts.index(each.shift_s)] < math.log(_MIN_POWER_RATIO)
             and self.penalty(each) + MIN_ROWS // _EDGE_ROWS < least
         ]  # fmt: skip
         most = max((each.balance for each in kept), default=0)
         kept = [each for each in kept if each.balance >= 0.5 * most]
 
         def rank(each: Alignment) -> tuple[bool, int, float]:
-            return each.balance <= EQUAL_BALANCE_PART * most, self.penalty(each), abs(each.begin_s)
+            return each.balance <= EQUAL_BALANCE_PART * most, self.penalty(each), abs(each.shift_s)
 
         return sorted(kept, key=rank)
 
@@ -202,7 +202,7 @@ class Begins:
             for first, last in parts
             for each in find_repeats(whole[first:last], one.first_s + first / one.rate_hz, fit, one.stimulus)
         ]
-        return [each - one.late_s for each in late_s]
+        return [each - one.offset_s for each in late_s]
 
     def stretches(self, shift_s: float) -> list[tuple[int, int]]:
         """Return the stretches by which a start is followed; the last one is that with the least residual."""
@@ -216,7 +216,7 @@ class Begins:
         A DAQ that is started before the session, or stopped after it, records such rows.
         """
         one = self._one
-        places = [(each - one.late_s - shift_s - one.first_s) * one.rate_hz for each in one.stimulus.span_s]
+        places = [(each - one.offset_s - shift_s - one.first_s) * one.rate_hz for each in one.stimulus.span_s]
         inside, busy = (min(b, places[1]) - max(a, places[0]) for a, b in ((0, len(one.values)), self._busy))
         return round(2.0 * max(0.0, busy) - inside)
 
@@ -229,7 +229,7 @@ class Begins:
     def follow_candidates(self, shifts: Sequence[float]) -> None:
         """Follow starts until two are equally good and have a residual of noise alone.
 
-        Begins are ordered by the residual of their stretches, and at equal residuals by the number of rows in the
+        Starts are ordered by the residual of their stretches, and at equal residuals by the number of rows in the
         session. Earlier candidates that were not followed are included.
         """
         one = self._one
@@ -289,11 +289,11 @@ def trim_quiet_ends(found: Alignment, one: RowSource) -> Alignment:
     odd = found.rows_at(fit.times_s[_find_outliers(fit)])
     runs, (first, last) = list(found.track.runs), found.track.inside
     loud = _MIN_POWER_PART * float(np.nanvar(one.values[first:last]))
-    begin = int(odd[odd < runs[0].begin + _BLOCK_ROWS].max(initial=runs[0].begin - 1)) + 1
-    if runs[0].begin < begin < runs[0].end and np.nanvar(one.values[runs[0].begin : begin]) < loud:
-        first, runs[0] = begin, replace(runs[0], begin=begin)
+    start = int(odd[odd < runs[0].start + _BLOCK_ROWS].max(initial=runs[0].start - 1)) + 1
+    if runs[0].start < start < runs[0].end and np.nanvar(one.values[runs[0].start : start]) < loud:
+        first, runs[0] = start, replace(runs[0], start=start)
     end = int(odd[odd >= runs[-1].end - _BLOCK_ROWS].min(initial=runs[-1].end))
-    if runs[-1].begin < end < runs[-1].end and np.nanvar(one.values[end : runs[-1].end]) < loud:
+    if runs[-1].start < end < runs[-1].end and np.nanvar(one.values[end : runs[-1].end]) < loud:
         last, runs[-1] = end, replace(runs[-1], end=end)
     return replace(found, track=replace(found.track, runs=runs, inside=(first, last)))
 

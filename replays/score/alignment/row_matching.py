@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.alignment.overlap import find_begins
+from replays.score.alignment.overlap import find_starts
 from replays.score.records.recorded import Recorded
 from replays.score.records.scale import Scale, find_scale, scales
 from replays.score.records.sent import Sent, Session
@@ -37,7 +37,7 @@ class SignalRows:
         step, phase: The signal has the rows whose number modulo the step is the phase.
         early: Number of its first rows that precede the session.
         start: Place of the next row, among such rows of the session.
-        begin: Place of the very first row, among all available rows of the session; negative before these.
+        offset: Place of the very first row, among all available rows of the session; negative before these.
     """
 
     scale: Scale
@@ -45,7 +45,7 @@ class SignalRows:
     phase: int = 0
     early: int = 0
     start: int = 0
-    begin: int = 0
+    offset: int = 0
 
 
 class _Search:
@@ -53,20 +53,20 @@ class _Search:
 
     Attributes:
         held: Index and counts of the first rows of each group of the session.
-        begins: Place of the first row of each table, if known, by the table's identity.
+        offsets: Place of the first row of each table, if known, by the table's identity.
     """
 
     def __init__(self, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session) -> None:
         self._recorded, self._wires, self._session = recorded, wires, session
         self.held = {group: session.early(group) for group in session.groups}
-        self.begins: dict[int, int] = {}
+        self.offsets: dict[int, int] = {}
         self._searched: dict[int, set[str]] = {}
 
-    def select_rows_from(self, name: str, of: str, begin: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
-        """Return values, unit, counts and channel of the same rows: row j of the file is row begin + j step there."""
+    def select_rows_from(self, name: str, of: str, offset: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
+        """Return values, unit, counts and channel of the same rows: row j of the file is row offset + j step there."""
         channel, signal, step = self._session.channels[of], self._recorded[name], self.find_step(name, of)
-        skipped = max(0, -(begin // step))
-        place, few = begin + skipped * step, _MAX_SCALE_ROWS
+        skipped = max(0, -(offset // step))
+        place, few = offset + skipped * step, _MAX_SCALE_ROWS
         values, there = signal.early[skipped:], self.held[channel.group][1][place:]
         if skipped and len(values) < min(_MAX_SCALE_ROWS, signal.rows - skipped):
             values = signal.table.stretch(skipped, _MAX_SCALE_ROWS)[:, 1 + signal.column]
@@ -81,21 +81,21 @@ class _Search:
         sent_hz = self._session.rate_hz(self._session.channels[of].group)
         return max(1, round(sent_hz / (self._recorded[name].rate_hz or sent_hz)))
 
-    def make_rows(self, scale: Scale, step: int, begin: int, group: str) -> SignalRows:
+    def make_rows(self, scale: Scale, step: int, offset: int, group: str) -> SignalRows:
         """Return the rows of a signal whose first row is at a place in the session."""
         index, _ = self.held[group]
-        phase = (index + begin) % step
-        start = max(0, begin - (phase - index) % step) // step
-        return SignalRows(scale, step, phase, max(0, -(begin // step)), start, begin)
+        phase = (index + offset) % step
+        start = max(0, offset - (phase - index) % step) // step
+        return SignalRows(scale, step, phase, max(0, -(offset // step)), start, offset)
 
-    def is_better(self, begin: int, other: int, signals: Iterable[tuple[str, str, Scale]], *, known: bool) -> bool:
+    def is_better(self, offset: int, other: int, signals: Iterable[tuple[str, str, Scale]], *, known: bool) -> bool:
         """Return whether all rows in the session are equal from a start, but not from another one.
 
         For a nearly repeating signal, other starts have more rows in the session, nearly all of which are equal. The
         unequal ones are then distributed; if they are consecutive, these rows are stale instead.
 
         Args:
-            begin: Place of the first row in the session, or negative.
+            offset: Place of the first row in the session, or negative.
             other: Another such place.
             signals: Signals of one table: name, channel and scale.
             known: Whether another table of the file has this start. If so, any unequal row from the other one counts;
@@ -103,24 +103,24 @@ class _Search:
         """
         moving, unequal, expected = 0, 0, 0.0
         for name, of, scale in signals:
-            longest, part, same = self.compare(name, of, begin, scale)
+            longest, part, same = self.compare(name, of, offset, scale)
             if part < 1.0:
                 return False
             wrong, step = ~self.compare(name, of, other, scale)[2], self.find_step(name, of)
-            first = max(0, -(begin // step)) - max(0, -(other // step))
+            first = max(0, -(offset // step)) - max(0, -(other // step))
             both = wrong if known else wrong[max(0, first) : max(0, first + len(same))]
             moving, unequal = moving + longest, unequal + int(both.sum())
             expected += len(both) * float(wrong.mean()) if len(wrong) else 0.0
         return moving >= _MIN_MOVING and 0 < unequal <= _MAX_UNEQUAL + 1.5 * expected
 
-    def compare(self, name: str, of: str, begin: int, scale: Scale) -> tuple[int, float, np.ndarray]:
+    def compare(self, name: str, of: str, offset: int, scale: Scale) -> tuple[int, float, np.ndarray]:
         """Return the agreement of the counts of the first rows in the session.
 
         Returns:
             Length of the longest run of equal rows, not counting constant ones; part of the rows that are equal;
             whether each row is equal, shape (n,).
         """
-        values, _, there, _ = self.select_rows_from(name, of, begin)
+        values, _, there, _ = self.select_rows_from(name, of, offset)
         same = scale.counts(values) == scale.sent(there)
         moving = np.concatenate([[0], np.cumsum(np.append(True, np.diff(there) != 0)[: len(there)])])
         ends = np.concatenate([[-1], np.flatnonzero(~same), [len(same)]])
@@ -132,35 +132,35 @@ class _Search:
         signal, channel, step = self._recorded[name], self._session.channels[of], self.find_step(name, of)
         table = id(signal.table)
         _, counts = self.held[channel.group]
-        late_s = self._wires[name].late_s, self._wires[name].own_s
-        late = [round(each * self._session.rate_hz(channel.group)) for each in late_s]
+        offsets_s = self._wires[name].offset_s, self._wires[name].own_s
+        late = [round(each * self._session.rate_hz(channel.group)) for each in offsets_s]
         placed, most = list[tuple[bool, int, int, Scale]](), list[bool]()
 
-        def try_begin(begin: int) -> bool:
-            values, unit, there, _ = self.select_rows_from(name, of, begin)
+        def try_offset(offset: int) -> bool:
+            values, unit, there, _ = self.select_rows_from(name, of, offset)
             if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
-                longest, part, _ = self.compare(name, of, begin, scale)
-                placed.append((scale.clean, longest, begin, scale))
+                longest, part, _ = self.compare(name, of, offset, scale)
+                placed.append((scale.clean, longest, offset, scale))
                 most.append(scale.clean and part > _MIN_EQUAL_PART)
                 return scale.clean and part == 1.0
             return False
 
-        likely = dict.fromkeys([self.begins.get(table, late[0]), *late, *self.begins.values()])
-        if not any(map(try_begin, likely)):
+        likely = dict.fromkeys([self.offsets.get(table, late[0]), *late, *self.offsets.values()])
+        if not any(map(try_offset, likely)):
             early, bits = signal.early[:_MAX_SCALE_ROWS], signal.lost_bits
             there = counts[:, self._session.place(of)] >> bits << bits
             likely = self._find_overlaps(name, of, step) if not any(most) else []
             fewest, known = min(len(early), len(there) // step), scales(signal.unit, channel, signal.early, there)
-            found = (find_begins([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
-            any(map(try_begin, likely or next((places for places in found if places), [])))
+            found = (find_starts([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
+            any(map(try_offset, likely or next((places for places in found if places), [])))
         if not placed:
             return None
-        *_, begin, scale = max(placed, key=lambda each: each[:2])
+        *_, offset, scale = max(placed, key=lambda each: each[:2])
         for _, _, other, its in placed:
-            if its.clean and self.is_better(other, begin, [(name, of, its)], known=False):
-                begin, scale = other, its
-        self.begins.setdefault(table, begin)
-        return self.make_rows(scale, step, begin, channel.group)
+            if its.clean and self.is_better(other, offset, [(name, of, its)], known=False):
+                offset, scale = other, its
+        self.offsets.setdefault(table, offset)
+        return self.make_rows(scale, step, offset, channel.group)
 
     def _find_overlaps(self, name: str, of: str, step: int) -> list[int]:
         """Return candidate starts of the table by all rows of both, for a few signals, as each reads both files."""
@@ -177,7 +177,7 @@ class _Search:
         for scale in scales(signal.unit, channel, np.concatenate(some), self.held[channel.group][1][:, column]):
             here = (scale.counts(part[:, 1]) for part in signal.table.parts([signal.column]))
             there = (scale.sent(part[:, column] >> bits << bits) for part in Sent(self._session, [channel.group]))
-            if places := find_begins(here, there, step, fewest):
+            if places := find_starts(here, there, step, fewest):
                 return places
         return []
 
@@ -202,7 +202,7 @@ def identify_signals(
         for of in dict.fromkeys(each for each in likely if each in session.channels):
             if (one := search.find_rows(name, of)) is None:
                 continue
-            longest, part, _ = search.compare(name, of, one.begin, one.scale)
+            longest, part, _ = search.compare(name, of, one.offset, one.scale)
             if longest > best or part == 1.0:
                 best, rows[name] = longest, one
                 found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
@@ -216,27 +216,27 @@ def identify_signals(
         if rows or len(asked) < _MAX_SEARCHES:
             asked.append(name)
             identify(name, session.channels)
-    # Rows of a table begin together: where one signal matches from several starts, another one decides.
+    # Rows of a table start together: where one signal matches from several starts, another one decides.
     for table in {id(recorded[name].table) for name in rows}:
         names = [name for name in rows if id(recorded[name].table) == table]
-        choices = list(dict.fromkeys(rows[name].begin for name in names))
+        choices = list(dict.fromkeys(rows[name].offset for name in names))
 
-        def agreed(begin: int) -> int:
-            signals = [(each, found[each].channel, begin, rows[each].scale) for each in names]  # noqa: B023
+        def agreed(offset: int) -> int:
+            signals = [(each, found[each].channel, offset, rows[each].scale) for each in names]  # noqa: B023
             return sum(search.compare(*signal)[0] for signal in signals)
 
         best = max(choices, key=agreed) if choices[1:] else choices[0]
         signals = [(each, found[each].channel, rows[each].scale) for each in names]
-        for other in dict.fromkeys([*choices, *search.begins.values()]):
+        for other in dict.fromkeys([*choices, *search.offsets.values()]):
             best = other if search.is_better(other, best, signals, known=other not in choices) else best
-        search.begins[table] = best
+        search.offsets[table] = best
         for name in names:
             one, group = rows[name], session.channels[found[name].channel].group
-            rows[name] = search.make_rows(one.scale, one.step, search.begins[table], group)
+            rows[name] = search.make_rows(one.scale, one.step, search.offsets[table], group)
 
     def is_shown(name: str) -> bool:
         one = rows[name]
-        return one.scale.clean and search.compare(name, found[name].channel, one.begin, one.scale)[1] > _MIN_EQUAL_PART
+        return one.scale.clean and search.compare(name, found[name].channel, one.offset, one.scale)[1] > _MIN_EQUAL_PART
 
     # Channels of noise alone correlate with none: their counts are found from the start of another signal.
     if 2 * len(rows) <= len(wires) and not any(map(is_shown, rows)):
@@ -250,15 +250,15 @@ def identify_signals(
         named = name if name in session.channels else "" if wire.rivals else wire.channel
         if name not in rows and named:
             step = search.find_step(name, named)
-            begin = search.begins.get(id(recorded[name].table), 0)
-            values, unit, counts, channel = search.select_rows_from(name, named, begin)
+            offset = search.offsets.get(id(recorded[name].table), 0)
+            values, unit, counts, channel = search.select_rows_from(name, named, offset)
 
             def deviation(scale: Scale) -> float:
                 return float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values)) / scale.each)  # noqa: B023
 
             found[name] = replace(wire, channel=named)
             scale = replace(min(scales(unit, channel, values[:0], counts), key=deviation), known=False)
-            rows[name] = search.make_rows(scale, step, begin, channel.group)
+            rows[name] = search.make_rows(scale, step, offset, channel.group)
     known = {name: each for name, each in rows.items() if each.scale.known}
     # A DAQ's converter leaves out bits of all signals equally; if one signal has fewer bits, they are lost later.
     adc_bits = {name: session.channels[found[name].channel].adc_bits for name in known}

@@ -59,7 +59,7 @@ class RowSource:
     session_s: float
 
     @property
-    def late_s(self) -> float:
+    def offset_s(self) -> float:
         """Time of the session less time of the file [s]."""
         return self.wire.own_s + self.session_s
 
@@ -79,7 +79,7 @@ class Alignment:
         own_s: Session less file time where the track's time error is 0, by followed signal [s].
         first_s, rate_hz, rows: Time of the first row [s], sampling rate [Hz], and number of rows.
         upright: Number of signals with a positive gain.
-        begin_s: Delay of the start in the session relative to that of the wires [s].
+        shift_s: Delay of the start in the session relative to that of the wires [s].
         ambiguous: Whether other starts explain the record equally well.
         steps_doubted: Whether another start explains more rows, by steps that this one does not need.
     """
@@ -91,7 +91,7 @@ class Alignment:
     rate_hz: float
     rows: int
     upright: int = 0
-    begin_s: float = 0.0
+    shift_s: float = 0.0
     ambiguous: bool = False
     steps_doubted: bool = False
 
@@ -112,7 +112,7 @@ class Alignment:
         values = np.full(high - low + 1, np.nan)
         values[at - low] = source.values[explained]
         line = self.track.line(0.5 * (low + high)) * self.rate_hz ** (np.arange(3.0) - 1.0)
-        own_s = self.own_s.get(source.name, source.late_s + self.begin_s)
+        own_s = self.own_s.get(source.name, source.offset_s + self.shift_s)
         curve = float(line[0]) + own_s, float(line[1]), float(line[2])
         return values, self.first_s + np.arange(low, high + 1) / self.rate_hz, curve
 
@@ -149,25 +149,25 @@ def find_busiest(sources: Sequence[RowSource], within: tuple[int, int], length: 
         steps = np.nan_to_num(np.diff(one.values[first:last], append=one.values[last - 1])) ** 2
         power += steps / max(float(steps.sum()), 1e-300)
     sums = np.concatenate([[0.0], np.cumsum(power)])
-    begin = first + int(np.argmax(sums[length:] - sums[:-length]))
-    return begin, begin + length
+    start = first + int(np.argmax(sums[length:] - sums[:-length]))
+    return start, start + length
 
 
 def _fit_stretches(sources: Sequence[RowSource], shift_s: float, stretch: tuple[int, int]) -> dict[str, Waveform]:
     """Return the fits of a stretch from one start, of the signals that are found in it."""
     found = {}
     for one in sources:
-        fit = fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, stretch)
+        fit = fit_stretch(one.values, one.times_s, one.stimulus, one.offset_s + shift_s, stretch)
         if fit is not None and fit.likeness > MIN_LIKENESS and abs(fit.drift) < _MAX_DRIFT:
             found[one.name] = fit
     return found
 
 
-def _refine_begin_s(one: RowSource, shift_s: float, stretch: tuple[int, int]) -> float:
+def _refine_shift_s(one: RowSource, shift_s: float, stretch: tuple[int, int]) -> float:
     """Return the start near a given one from which a stretch has the least residual [s]."""
     y, period_s = np.nan_to_num(one.values[slice(*stretch)]), 1.0 / one.rate_hz
     reach, n = math.ceil(_SEARCH_RANGE_S * one.rate_hz * _OVERSAMPLING), len(y)
-    first_s = one.first_s + stretch[0] * period_s + one.late_s + shift_s
+    first_s = one.first_s + stretch[0] * period_s + one.offset_s + shift_s
     grid_s = first_s + np.arange(-reach, _OVERSAMPLING * (n - 1) + reach + 1) * (period_s / _OVERSAMPLING)
     if grid_s[0] < one.stimulus.span_s[0] or grid_s[-1] > one.stimulus.span_s[1]:
         return shift_s
@@ -178,7 +178,7 @@ def _refine_begin_s(one: RowSource, shift_s: float, stretch: tuple[int, int]) ->
     at = np.flatnonzero((alike[1:-1] >= alike[:-2]) & (alike[1:-1] > alike[2:])) + 1
     at = at[np.argsort(-alike[at])][:_MAX_CANDIDATES]
     shifts = [shift_s, *(shift_s + (at - reach) * period_s / _OVERSAMPLING)]
-    fits = [fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + each, stretch) for each in shifts]
+    fits = [fit_stretch(one.values, one.times_s, one.stimulus, one.offset_s + each, stretch) for each in shifts]
     left = [math.inf if fit is None else float(np.var(fit.residual)) for fit in fits]
     return float(shifts[int(np.argmin(left))])
 
@@ -192,7 +192,7 @@ def follow(sources: Sequence[RowSource], shift_s: float, stretches: Sequence[tup
         stretches: Stretches of rows that are tried first.
     """
     best: tuple[float, tuple[int, int], dict[str, Waveform]] | None = None
-    near_s = _refine_begin_s(sources[0], shift_s, stretches[0])
+    near_s = _refine_shift_s(sources[0], shift_s, stretches[0])
     for n, stretch in enumerate(stretches):
         at_s = shift_s if n else near_s
         fits = _fit_stretches(sources, at_s, stretch)
