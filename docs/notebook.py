@@ -18,8 +18,8 @@ run_up = rig.simulate("run-up", faster)
 # %% The same of recordings: of the hammer at another speed, and of a run-up that is recorded here, with more unbalance
 heavier = rig.load_scene("run-up", faster | {"shaft.unbalance_eccentricity": 0.2})
 write_run(rig.Simulation(heavier), Path("run-up.mcap"), force=True)
-with Recording.open("replays/sessions/hammer-5.2.mcap") as blow, Recording.open("run-up.mcap") as run:
-    recorded = [(blow.samples("probes"), blow.edges()), (run.samples("probes"), run.edges())]
+with Recording.open("replays/sessions/hammer-5.2.mcap") as impact, Recording.open("run-up.mcap") as run:
+    recorded = [(impact.samples("probes"), impact.edges()), (run.samples("probes"), run.edges())]
 
 # %% A row each: orbit; full spectrum, where a whirl against the spin is on the left; once-per-turn amplitude and phase
 figure, axes = plt.subplots(2, 4, figsize=(16, 7), layout="constrained")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ class Turn:
         speed_hz: Mean speed [Hz].
         peak_to_peak: Peak-to-peak value of each channel, in its unit.
         gap: Mean of each channel, in its unit (DC gap of a probe).
-        once: 1X vector of each channel: amplitude in its unit, phase relative to the pulse (negative: lag).
+        synchronous: 1X vector of each channel: amplitude in its unit, phase relative to the pulse (negative: lag).
         samples: Samples of the turn.
     """
 
@@ -31,8 +32,14 @@ class Turn:
     speed_hz: float
     peak_to_peak: dict[str, float]
     gap: dict[str, float]
-    once: dict[str, complex]
+    synchronous: dict[str, complex]
     samples: Samples
+
+    @property
+    def once(self) -> dict[str, complex]:
+        """The attribute `synchronous` under its old name."""
+        warnings.warn("Turn.once is Turn.synchronous now", DeprecationWarning, stacklevel=2)
+        return self.synchronous
 
 
 def find_pulses(samples: Samples) -> np.ndarray:
@@ -47,12 +54,12 @@ def measure_turn(samples: Samples, begin_s: float, end_s: float) -> Turn:
     """Return the turn of the shaft between two pulse times [s]."""
     first, last = np.searchsorted(samples.times_s, [begin_s, end_s])
     rows = samples.rows(int(first), int(last))
-    once = {}
+    vectors = {}
     for name in rows.names:
         _, vector = synchronous(rows[name], rows.times_s, [begin_s, end_s])
-        once[name] = complex(vector[0]) if len(vector) else complex(math.nan, math.nan)
+        vectors[name] = complex(vector[0]) if len(vector) else complex(math.nan, math.nan)
     return Turn(
         begin_s=float(begin_s), speed_hz=float(1.0 / (end_s - begin_s)),
         peak_to_peak={name: float(np.ptp(rows[name])) for name in rows.names},
-        gap={name: float(rows[name].mean()) for name in rows.names}, once=once, samples=rows,
+        gap={name: float(rows[name].mean()) for name in rows.names}, synchronous=vectors, samples=rows,
     )  # fmt: skip

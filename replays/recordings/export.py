@@ -279,7 +279,7 @@ class McapRun:
         for fault in frame.documents:
             self._writer.write(wire.FAULTS, wire.encode_document(fault), self._wall(frame.tick))
         for message in frame.messages:
-            if "zenoh" in message.doors:
+            if "zenoh" in message.transports:
                 self._writer.write(message.key, wire.encode_block(message.block), self._wall(frame.tick))
                 self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
 

@@ -18,12 +18,12 @@ import numpy as np
 from rig.base.errors import InputError, Words
 from rig.base.wire import sensor_key
 from rig.channels.faults import (
-    DOORS,
+    TRANSPORTS,
     At,
+    BlockFault,
     Draws,
     Kind,
     NoFilter,
-    OfBlocks,
     Restart,
     Setting,
     acts,
@@ -95,7 +95,7 @@ class FaultInjector:
         self.table, self.conditioners, self._seed, self.row_ticks = table, conditioners, seed, row_ticks
         self._setting = setting
         self.sending = Sending()
-        self.doors: tuple[str, ...] = DOORS
+        self.transports: tuple[str, ...] = TRANSPORTS
         """Transports of the rig."""
         self.channels = table.channels
         """All channels by name, ..."""
@@ -132,11 +132,11 @@ class FaultInjector:
             InputError: The fault is impossible on them.
         """
         kind = command.what
-        if not isinstance(kind, OfBlocks):
+        if not isinstance(kind, BlockFault):
             return find_channels(kind, command.channel, self.table, **self._setting._asdict())
         if isinstance(kind, Restart) and self._next_row_tick(tick) == 0:
             raise InputError("kind", "one that shows from the first row on, such as dropout", kind.name())
-        return self.table.groups[find_group(kind, command.channel, self.table, self.doors)].names
+        return self.table.groups[find_group(kind, command.channel, self.table, self.transports)].names
 
     def check_all(self, timed: Iterable[tuple[int, object]]) -> None:
         """Raise an error for the first impossible fault of a scene.
@@ -166,7 +166,7 @@ class FaultInjector:
             InputError: The fault is too small, too short or too rare; the message has the limit.
         """
         kind, positions = command.what, {name: n for n, name in enumerate(self.channels)}
-        for name in names[:1] if isinstance(kind, OfBlocks) else names:
+        for name in names[:1] if isinstance(kind, BlockFault) else names:
             channel = self.channels[name]
             source = self.channels[kind.reads[0]] if kind.reads else None
             check_time(kind, channel.rate_hz, tick, self.row_ticks, command.for_s)
@@ -248,7 +248,7 @@ class FaultInjector:
         names, kind = self.find_targets(command, tick), command.what
         positions = {name: n for n, name in enumerate(self.channels)}
         draws = {name: self._build_draws(self._fault_count, kind, positions[name]) for name in names}
-        if isinstance(kind, OfBlocks):
+        if isinstance(kind, BlockFault):
             draws = {"": self._build_draws(self._fault_count, kind, 0)}
             self.sending.active.append(Active(self._fault_count, kind, names, row, draws, sensor_key(command.channel)))
         else:

@@ -270,13 +270,13 @@ class Simulation:
         insort(self.pending, (self.tick, command), key=lambda entry: entry[0])
         return self.tick
 
-    def serve(self, doors: tuple[str, ...]) -> None:
+    def set_transports(self, transports: tuple[str, ...]) -> None:
         """Set the transports of the rig.
 
         Raises:
             InputError: The scene has a fault of a transport that does not exist.
         """
-        self.faults.doors = doors
+        self.faults.transports = transports
         self.faults.check_all(self.pending)
 
     def warm_up(self) -> None:

@@ -42,7 +42,7 @@ def page() -> str:
 def _fields(command: Any) -> str:
     """Return the fields of a command with their limits and defaults."""
     fields = "; ".join(_field(key, field) for key, field in command.model_fields.items() if key != "command")
-    return fields.replace("`what`", "`kind` and its numbers, below") or "no fields"
+    return fields.replace("`what`", "`kind` and its parameters, below") or "no fields"
 
 
 def _field(key: str, field: Any) -> str:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from rig.base import wire
 from rig.base.errors import InputError, Words
 from rig.base.text import replace_nonfinite
-from rig.channels.faults import DOORS, Message
+from rig.channels.faults import TRANSPORTS, Message
 from rig.run.commands import SUMMARIES
 from rig.run.commands.table import SERVICE_COMMANDS
 from rig.serve.devices import Devices
@@ -33,7 +33,7 @@ from rig.serve.request_handler import (
     StepRequest,
 )
 from rig.serve.served_run import ServedRun
-from rig.serve.transport import Server, get_doors
+from rig.serve.transport import Server, get_transports
 from rig.serve.transport.limit import CommandLimit
 from rig.serve.waiting import BoundedQueue
 
@@ -121,7 +121,7 @@ class Service(ServedRun):
             # In lockstep many commands cause no delay, and none may be refused because of the wall clock.
             limit=limit or (CommandLimit(_UNLIMITED_HZ) if isinstance(clock, Lockstep) else None),
         )
-        simulation.serve(tuple(get_doors(server)))
+        simulation.set_transports(tuple(get_transports(server)))
         self._simulation = simulation
         self._block_ticks = block_ticks
         self._status_period_s = status_period_s
@@ -468,11 +468,11 @@ class Service(ServedRun):
     def _publish_block(self, message: Message) -> None:
         # A client that misses rows learns from the end event what is missing.
         self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
-        if "zenoh" in message.doors:
+        if "zenoh" in message.transports:
             self._sent_counts[message.key] = self._sent_counts.get(message.key, 0) + 1
         servers = [self._server]
-        if message.doors != DOORS:
-            servers = [server for door, server in get_doors(self._server).items() if door in message.doors]
+        if message.transports != TRANSPORTS:
+            servers = [server for name, server in get_transports(self._server).items() if name in message.transports]
         for server in servers:
             server.publish(message.key, wire.encode_block(message.block))
 

@@ -20,20 +20,20 @@ def input_count(default: int) -> int:
     return int(os.environ.get("RIG_FUZZ_INPUTS", default))
 
 
-class Door:
+class InputTally:
     """Counts of inputs by result: accepted, refused in one line, or a fault. Each fault is kept once with its place."""
 
     def __init__(self) -> None:
-        self.taken = self.refused = 0
+        self.accepted = self.refused = 0
         self.faults: dict[str, Any] = {}
 
     @contextlib.contextmanager
-    def tried(self, what: object, *also: type[Exception]) -> Iterator[None]:
+    def attempt(self, what: object, *also: type[Exception]) -> Iterator[None]:
         """Try one input; `what` identifies it in the report of a fault."""
         begin = time.monotonic()
         try:
             yield
-            self.taken += 1
+            self.accepted += 1
         except (InputError, DiskError, *also) as error:
             self.refused += 1
             line = str(error)
@@ -47,10 +47,10 @@ class Door:
             self.faults["too long"] = what
 
 
-def check_doors(doors: dict[str, Door]) -> None:
+def check_tallies(tallies: dict[str, InputTally]) -> None:
     """Print the counts, and fail if there is a fault."""
-    for name, door in doors.items():
-        print(f"{name}: {door.taken} taken, {door.refused} refused, {len(door.faults)} kinds of faults")
+    for name, tally in tallies.items():
+        print(f"{name}: {tally.accepted} accepted, {tally.refused} refused, {len(tally.faults)} kinds of faults")
     print(f"largest memory of the process {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
-    found = [f"{name}: {place}: {what}" for name, door in doors.items() for place, what in door.faults.items()]
+    found = [f"{name}: {place}: {what}" for name, tally in tallies.items() for place, what in tally.faults.items()]
     assert not found, "\n".join(found)

@@ -294,7 +294,8 @@ def test_hostile_messages_to_the_hub_have_no_effect_on_others() -> None:
             if number % 3 == 0:
                 hub.reply("join", b'{"endpoint": "ghost%d"}' % number)
             hub.reply(("join", "set", "flush", "status")[random.integers(4)], request)
-            hub.watch(f"rig/can/can0/node/{names[random.integers(3, 7)]}{random.integers(3000)}", random.random() < 0.7)
+            name = f"{names[random.integers(3, 7)]}{random.integers(3000)}"
+            hub.record_token(f"rig/can/can0/node/{name}", random.random() < 0.7)
             with contextlib.suppress(codec.CodecError):
                 villain.receive(codec.decode(payload[16:]))
             if number % 20 == 0:
@@ -531,7 +532,7 @@ def make_request(random: np.random.Generator, codec: Codec) -> bytes:
                 random.bytes(size) if random.random() < 0.7 else bytes(size), "little", signed=each == "q"
             )
         body += struct.pack("<" + each, value)
-    if kind is not None and kind.TAIL is not None:
+    if kind is not None and kind.LAST_FIELD is not None:
         texts = (b"x", b"nan", b"1e5", b"-y", b"\xff", b"\0\x1b[2J", "é".encode(), b"1_0", random.bytes(24), b"9" * 400)
         body += texts[random.integers(len(texts))]
     return head + body if random.random() < 0.6 else mutate(random, head + body)

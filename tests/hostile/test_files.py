@@ -26,7 +26,7 @@ from recorder.reader import Recording, join
 from recorder.rewrite import is_whole, recover
 from rig.base.errors import InputError
 from rig.cli.main import main
-from tests.hostile import Door, check_doors, input_count
+from tests.hostile import InputTally, check_tallies, input_count
 from tests.hostile.files import (
     PROBES,
     SESSIONS,
@@ -121,11 +121,11 @@ def test_every_changed_byte_that_alters_contents_is_reported(
     messages = before[0]
     spoilt = tmp_path / ("x.mcap" if finished else "x.mcap.part")
     rng = np.random.default_rng([2 + finished, input_count(150)])
-    door, same, shorter = Door(), 0, 0
+    tally, same, shorter = InputTally(), 0, 0
     for number in range(input_count(150)):
         changed = spoil_bytes(data, rng)
         spoilt.write_bytes(changed)
-        with door.tried(number):
+        with tally.attempt(number):
             recording = Recording.open(spoilt)
             found = read_contents(recording)
             if found == before and recording.complete == finished:
@@ -137,8 +137,8 @@ def test_every_changed_byte_that_alters_contents_is_reported(
             sure = found[0] if not recording.unchecked else found[0][: -_unsure(recording)]
             assert sure == messages[: len(sure)], "a message is another one"
             assert found[3:6] == before[3:6], "a document is another one"
-    check_doors({f"bytes ({same} the same, {shorter} told to be shorter)": door})
-    assert door.refused > 0.3 * input_count(150)
+    check_tallies({f"bytes ({same} the same, {shorter} told to be shorter)": tally})
+    assert tally.refused > 0.3 * input_count(150)
 
 
 def _unsure(recording: Recording) -> int:
@@ -148,14 +148,14 @@ def _unsure(recording: Recording) -> int:
 
 def test_a_malformed_file_is_read_or_refused_without_a_traceback(layout: Layout, tmp_path: Path) -> None:
     rng = np.random.default_rng([4, input_count(160)])
-    doors = {name: Door() for name in list_operations()}
+    tallies = {name: InputTally() for name in list_operations()}
     for number in range(input_count(160)):
         path = layout.spoilt(rng).write(tmp_path / "x.mcap", rng)
-        name, use = list(list_operations().items())[number % len(doors)]
-        with doors[name].tried(number):
+        name, use = list(list_operations().items())[number % len(tallies)]
+        with tallies[name].attempt(number):
             use(path, tmp_path)
-    check_doors(doors)
-    assert all(door.taken for door in doors.values())
+    check_tallies(tallies)
+    assert all(tally.accepted for tally in tallies.values())
 
 
 def test_a_block_in_a_far_future_costs_neither_time_nor_memory(layout: Layout, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from rig.cli.main import main
 from rig.cli.output import tables
 from rig.physics.parameters import SETS, load_parameters
 from rig.run.scenes import SCENES, load_scene, parse_scene, read_value, scene_document, scene_names
-from tests.hostile import Door, check_doors, input_count
+from tests.hostile import InputTally, check_tallies, input_count
 from tests.hostile.files import Layout, Rng, spoil_bytes, spoil_document, write_file
 
 PIECES = (
@@ -88,15 +88,15 @@ def test_any_toml_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
             lambda path: read_value(text(path)),
         ),
     }
-    doors = {name: Door() for name in kinds}
+    tallies = {name: InputTally() for name in kinds}
     for number in range(input_count(120)):
         name = list(kinds)[number % len(kinds)]
         texts, load = kinds[name]
         path = tmp_path / f"x{name.strip('-')}.toml"
         path.write_bytes(data := spoil_toml(texts[int(rng.integers(0, len(texts)))], rng))
-        with doors[name].tried(data[:200]):
+        with tallies[name].attempt(data[:200]):
             load(path)
-    check_doors(doors)
+    check_tallies(tallies)
 
 
 def test_any_document_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_any_document_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None
         "criteria": ([read_toml(DEFAULT)], lambda document: check(Criteria, document, field="")),
     }
     rng = np.random.default_rng([7, input_count(200)])
-    doors = {name: Door() for name in kinds}
+    tallies = {name: InputTally() for name in kinds}
     for number in range(input_count(200)):
         name = list(kinds)[number % len(kinds)]
         documents, load = kinds[name]
@@ -118,9 +118,9 @@ def test_any_document_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None
             document = spoil_document(document, rng)
         if "\\ud800" in json.dumps(document, default=str):  # no file holds half a character
             continue
-        with doors[name].tried(number):
+        with tallies[name].attempt(number):
             load(document)
-    check_doors(doors)
+    check_tallies(tallies)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_foreign_logs_are_accepted_or_refused_in_one_line(tmp_path: Path) -> Non
     (tmp_path / "m.toml").write_text(X)
     mapping = load_mapping(tmp_path / "m.toml")
     rng = np.random.default_rng([6, input_count(80)])
-    doors = {suffix: Door() for suffix in whole}
+    tallies = {suffix: InputTally() for suffix in whole}
     logging.disable(logging.CRITICAL)
     for suffix in whole:  # the unchanged file is accepted
         if not suffix.endswith(".json"):
@@ -221,7 +221,7 @@ def test_foreign_logs_are_accepted_or_refused_in_one_line(tmp_path: Path) -> Non
         (folder / "a.wav.json").write_bytes(whole[".wav.json"])
         (folder / f"a{suffix}").write_bytes(data)
         file = folder / f"a{suffix.removesuffix('.json')}"
-        with doors[suffix].tried((suffix, number)), contextlib.redirect_stderr(io.StringIO()):
+        with tallies[suffix].attempt((suffix, number)), contextlib.redirect_stderr(io.StringIO()):
             for entry in open_source(file, FileOptions()).entries:
                 wanted = replace_source(mapping, entry.name, entry.group)
                 with contextlib.suppress(InputError):
@@ -232,7 +232,7 @@ def test_foreign_logs_are_accepted_or_refused_in_one_line(tmp_path: Path) -> Non
                 Recording.open(tmp_path / "out.mcap")
     logging.disable(logging.NOTSET)
     gc.collect()  # unclosed files are allowed here
-    check_doors(doors)
+    check_tallies(tallies)
 
 
 @pytest.mark.parametrize(("method", "rate_hz"), [("linear", 1_000_000), ("polyphase", 1_000_000), ("none", None)])

@@ -13,7 +13,7 @@ CLOCKS = frozenset({"monotonic", "perf_counter", "monotonic_ns", "perf_counter_n
 _SILENCE = "a silence, which every message begins again"
 _PERIOD = "repeats something at a period, and does not wait for an end"
 EXCEPTIONS = {
-    "drivers/can/bus/endpoints.py:forget_gone": "looks once at the age of each node, and does not wait",
+    "drivers/can/bus/endpoints.py:remove_departed": "looks once at the age of each node, and does not wait",
     "drivers/can/bus/outlets/outlet.py:_write_all": _SILENCE,
     "drivers/sources/can.py:_read": _SILENCE,
     "recorder/viewer/live.py:_draw_until_end": _PERIOD,

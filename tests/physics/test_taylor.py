@@ -281,8 +281,8 @@ def test_the_peak_agrees_with_the_law_for_every_exponent(stiffness: str) -> None
 @pytest.mark.parametrize("force", [300.0, 320.0, 330.0])
 def test_motion_along_a_line_continues_after_contact(friction: float, force: float) -> None:
     # At a sliding speed of exactly 0, phases that change at one depth change back at once.
-    blow = {"at_s": 0.018, "command": "hammer", "force_n": force, "duration_ms": 1.0, "direction": "y"}
-    changes = {**QUIET, "model.stator": "rigid", "drive.speed_hz": 0.0, "ring.clearance": 0.2685, "commands": [blow]}
+    impact = {"at_s": 0.018, "command": "hammer", "force_n": force, "duration_ms": 1.0, "direction": "y"}
+    changes = {**QUIET, "model.stator": "rigid", "drive.speed_hz": 0.0, "ring.clearance": 0.2685, "commands": [impact]}
     changes |= {"contact.restitution": 0.9478, "contact.friction": friction}
     one, other = (
         simulate("hammer", {**changes, "engine.name": name}, duration_s=0.05).simulation for name in ("taylor", "rk8")

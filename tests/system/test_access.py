@@ -150,12 +150,12 @@ class Rig:
                 self.server.announce(example(permission.keys[0]))
 
 
-def keys_of(doors: tuple[Permission, ...], action: Action) -> set[str]:
-    return {example(key) for permission in doors if permission.action is action for key in permission.keys}
+def keys_of(permissions: tuple[Permission, ...], action: Action) -> set[str]:
+    return {example(key) for permission in permissions if permission.action is action for key in permission.keys}
 
 
-def receivable(doors: tuple[Permission, ...]) -> set[str]:
-    return keys_of(doors, Action.RECEIVE)
+def receivable(permissions: tuple[Permission, ...]) -> set[str]:
+    return keys_of(permissions, Action.RECEIVE)
 
 
 class Attempt:
@@ -207,7 +207,7 @@ SUBJECTS = [
 @pytest.mark.parametrize(("name", "mode"), SUBJECTS)
 def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: str, folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
-    doors = get_permissions(name)
+    permissions = get_permissions(name)
     seen: list[tuple[str, bytes]] = []
     with (
         ZenohServer(plain, exposed=Exposure(exposed, read_holder(folders / "server", server=True))) as server,
@@ -229,9 +229,9 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         assert {str(reply.replier_id.zid) for reply in get_all_replies(session, "@/**") if reply.replier_id} <= own
         time.sleep(0.3)
         rig.publish()
-        allowed = receivable(doors)
+        allowed = receivable(permissions)
         until(lambda: allowed <= attempt.received and allowed <= attempt.heartbeats)
-        until(lambda: rig.heard >= keys_of(doors, Action.SEND) and rig.shown >= keys_of(doors, Action.SHOW))
+        until(lambda: rig.heard >= keys_of(permissions, Action.SEND) and rig.shown >= keys_of(permissions, Action.SHOW))
         # Before any forged message, an honest client receives the rig's own messages or none.
         forged_tokens = {
             key
@@ -246,16 +246,16 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         for token in attempt.tokens:
             token.undeclare()
         rig.announce()
-        until(lambda: all(map(attempt.sees, keys_of(doors, Action.WATCH))))
+        until(lambda: all(map(attempt.sees, keys_of(permissions, Action.WATCH))))
         tokens = {key for key in keys_of(PERMISSIONS, Action.WATCH) if attempt.sees(key)}
         until(lambda: len({key for key, _ in seen}) >= len(receivable(PERMISSIONS)))
-        assert {key for key, found in answers.items() if found} == keys_of(doors, Action.ASK)
+        assert {key for key, found in answers.items() if found} == keys_of(permissions, Action.ASK)
         assert attempt.received == allowed
         assert attempt.heartbeats == allowed
         assert history == allowed
-        assert rig.heard == keys_of(doors, Action.SEND)
-        assert {key for key in rig.shown if key in map(example, KEYS)} == keys_of(doors, Action.SHOW)
-        assert tokens == keys_of(doors, Action.WATCH)
+        assert rig.heard == keys_of(permissions, Action.SEND)
+        assert {key for key in rig.shown if key in map(example, KEYS)} == keys_of(permissions, Action.SHOW)
+        assert tokens == keys_of(permissions, Action.WATCH)
         assert forged_tokens == set()
         assert asked == {b"honest"}
         assert FORGED not in {bytes(reply.result.payload) for reply in replies}

@@ -90,8 +90,10 @@ def test_turns_are_those_of_the_shaft() -> None:
         assert turn.gap["disk_x"] == pytest.approx(x.mean())
         # The same by the closed form of a Fourier coefficient over the turn.
         angle = 2.0 * math.pi * (times_s - turn.begin_s) * turn.speed_hz
-        once = 2.0 * np.mean(x * np.exp(-1j * angle))
-        assert abs(turn.once["disk_x"] - once) < 0.02 * abs(once) + 1e-4
+        one_x = 2.0 * np.mean(x * np.exp(-1j * angle))
+        assert abs(turn.synchronous["disk_x"] - one_x) < 0.02 * abs(one_x) + 1e-4
+    with pytest.warns(DeprecationWarning, match=r"^Turn\.once is Turn\.synchronous now$"):
+        assert turns[0].once == turns[0].synchronous
 
 
 def test_rows_read_between_turns_belong_to_no_turn() -> None:

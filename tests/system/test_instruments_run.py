@@ -81,8 +81,8 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
 
             with Hammer.open(urls["hammer"][1]) as hammer, Daq.open(f"zenoh:{endpoint}", channels=["hammer"]) as daq:
                 done = hammer.trigger(force_n=200.0, duration_ms=5.0, direction="y")
-                blow = daq.read(20)
-                force = [blow]
+                impact = daq.read(20)
+                force = [impact]
                 while force[-1].times_s[-1] < done.time_s + 0.01:
                     force.append(daq.read(20))
                 peak = max(each["hammer"].max() for each in force)

@@ -154,8 +154,8 @@ def simulate_trip(
     """Simulate an impact at 0.1 s with the monitor in the loop; return the time to the trip [s], and whether whirl is
     established.
     """
-    blow = {"at_s": 0.1, "command": "hammer", "force_n": force_n}
-    changes = {"duration_s": 0.4, "drive.ramp_rate": ramp_hz_s, "commands": [blow], "sensors.groups": ["probes"]}
+    impact = {"at_s": 0.1, "command": "hammer", "force_n": force_n}
+    changes = {"duration_s": 0.4, "drive.ramp_rate": ramp_hz_s, "commands": [impact], "sensors.groups": ["probes"]}
     simulation = Simulation(load_scene("hammer", changes))
     device = Protection(
         Settings(alert_um=1500, danger_um=1500, alert_delay_s=delay_s, danger_delay_s=delay_s, startup_s=0.05)

@@ -56,8 +56,8 @@ class FakeSimulation:
         self.warmed_up = False
         self._scheduled: list[dict[str, Any]] = []
 
-    def serve(self, doors: tuple[str, ...]) -> None:
-        assert doors
+    def set_transports(self, transports: tuple[str, ...]) -> None:
+        assert transports
 
     def warm_up(self) -> None:
         self.warmed_up = True

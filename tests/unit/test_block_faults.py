@@ -35,7 +35,7 @@ def run(
                 simulation.submit("fault", {"channel": "probes", "for_s": TO - FROM, **fault})
         frame = simulation.advance(cut)
         for message in frame.messages:
-            if door in message.doors:
+            if door in message.transports:
                 block = message.block
                 found.setdefault(message.key, []).append((block.index, block.tick, block.values.copy()))
         fault_events += frame.documents
@@ -169,7 +169,7 @@ def test_impossible_faults_are_refused_with_the_possible_ones(request_: dict[str
 
 def test_an_unknown_transport_is_refused() -> None:
     simulation = Simulation(SCENE)
-    simulation.serve(("zenoh",))
+    simulation.set_transports(("zenoh",))
     with pytest.raises(InputError, match=r"door must be one that this rig has: zenoh \(a CAN bus: rig run --can\)"):
         simulation.submit("fault", {"channel": "probes", "kind": "dropout", "door": "can"})
 

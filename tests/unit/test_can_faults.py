@@ -153,7 +153,7 @@ def test_a_fault_on_can_does_not_affect_zenoh() -> None:
             sensor_key("probes"),
             lambda _, payload, door=door: came.setdefault(door, []).append(decode_block(payload, SAMPLE_SCHEMA).index),
         )
-    Service(simulation, Fanout([*servers.values()], doors=servers), FreeRun(), block_ticks=10_000).run()
+    Service(simulation, Fanout([*servers.values()], transports=servers), FreeRun(), block_ticks=10_000).run()
     assert came == {"can": [*range(2000, 8000, 200)], "zenoh": [*range(0, 4000, 200), *range(6000, 8000, 200)]}
     with pytest.raises(InputError, match="door must be one that this rig has: zenoh"):
         Service(Simulation(simulation.scene), MemoryServer(), FreeRun(), block_ticks=10_000)

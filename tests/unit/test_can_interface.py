@@ -313,7 +313,7 @@ def test_frames_that_do_not_exist_are_refused(wrong: can.Message, why: str) -> N
 
 def fill(bus: can.BusABC) -> None:
     # Some are sent meanwhile, more if this process is delayed.
-    for _ in range(10 * endpoints.WINDOW):
+    for _ in range(10 * endpoints.QUEUE_FRAMES):
         bus.send(message(0x100), timeout=0)
 
 
@@ -652,7 +652,7 @@ def test_random_payloads_over_zenoh_do_not_change_the_hub() -> None:
 def join_hub(hub: Hub, name: str, *, token: bool = False, **more: Any) -> dict[str, Any]:
     """Return the reply to an endpoint of another process that joins."""
     if token:
-        hub.watch(codec.node_key("can0", name), True)
+        hub.record_token(codec.node_key("can0", name), True)
     return hub.answer("join", {"endpoint": name, **more})
 
 
@@ -681,7 +681,7 @@ def test_endpoints_without_a_token_are_replaced_first() -> None:
         assert [row["name"] for row in rig.hub.status()["nodes"]] == [f"e{n}" for n in range(endpoints.MAX_ENDPOINTS)]
         # However many tokens a node declares, the newest counts.
         for number in range(5000):
-            rig.hub.watch(codec.node_key("can0", f"t{number}"), True)
+            rig.hub.record_token(codec.node_key("can0", f"t{number}"), True)
         assert rig.hub.endpoints.tokens.keys() >= {"t4999"}
         assert len(rig.hub.endpoints.tokens) <= 16 * endpoints.MAX_ENDPOINTS
 
@@ -712,7 +712,7 @@ def test_requests_under_the_name_of_another_node_are_refused(rig: Rig) -> None:
         time.sleep(0.3)
     else:
         # Tokens are for other processes.
-        rig.hub.watch(codec.node_key("can0", sender.name), False)
+        rig.hub.record_token(codec.node_key("can0", sender.name), False)
     for number in range(100):
         sender.send(message(0x100, bytes((number,))))
     assert [(item.arbitration_id, item.data[0]) for item in read(receiver, 100)] == [(0x100, n) for n in range(100)]
@@ -731,7 +731,7 @@ def test_an_endpoint_can_rejoin_under_its_name() -> None:
         assert second["secret"] != first["secret"]
         with pytest.raises(InputError, match="endpoint must be unused"):
             rig.hub.answer("flush", {"endpoint": "mine", "secret": first["secret"]})
-        rig.hub.watch(codec.node_key("can0", "mine"), False)
+        rig.hub.record_token(codec.node_key("can0", "mine"), False)
         third = join_hub(rig.hub, "mine")
         assert rig.hub.answer("flush", {"endpoint": "mine", "secret": third["secret"]}) == {}
 

@@ -274,7 +274,7 @@ def test_all_bits_of_a_can_frame_belong_to_one_signal_of_each_kind() -> None:
 
 
 def test_requests_to_instruments_have_the_fields_of_commands() -> None:
-    acts = {act for twin in TWINS for act in twin.CODEC.acts}
-    assert {"hammer", "speed", "release"} <= {act.COMMAND for act in acts} <= set(MECHANICAL)
-    for act in acts:
-        assert {each.name for each in fields(act)} == set(COMMANDS[act.COMMAND].quantities()), act
+    commands = {command for twin in TWINS for command in twin.CODEC.commands}
+    assert {"hammer", "speed", "release"} <= {command.COMMAND for command in commands} <= set(MECHANICAL)
+    for command in commands:
+        assert {each.name for each in fields(command)} == set(COMMANDS[command.COMMAND].quantities()), command

@@ -126,7 +126,7 @@ import rig
 
 def end(engine, step_us):
     changes = {"engine.name": engine, "engine.step_us": step_us, "engine.companion": False}
-    return rig.simulate("hammer", changes, duration_s=0.024)["disk_x"]  # the blow begins at 0.02 s
+    return rig.simulate("hammer", changes, duration_s=0.024)["disk_x"]  # the impact begins at 0.02 s
 
 exact = end("rk8", 25)
 coarse, fine = (np.abs(end("heun", step) - exact).max() for step in (25, 5))

@@ -572,7 +572,7 @@ def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
     per_mm = 0.2 / 0.0254
     near = [per_mm * (math.cos(angle) * x + math.sin(angle) * y) for angle in np.radians([45, 135])]
     delayed = 30.0 * np.sin(400 * (t - 12.5e-6))
-    blow = np.where(np.abs(t - 0.5) < 2.5e-3, 100.0 * np.cos(np.pi * (t - 0.5) / 5e-3), 0.0)
+    impact = np.where(np.abs(t - 0.5) < 2.5e-3, 100.0 * np.cos(np.pi * (t - 0.5) / 5e-3), 0.0)
     trigger = np.where((t > 0.1) & (t < 0.3) | (t > 0.7), 5.0, 0.0)
     late = 1000  # samples by which the second recorder began later
     rows_csv(tmp_path / "daq.csv", {
@@ -581,7 +581,7 @@ def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
         "Key": 5.0 * (np.modf(6.2 * t + 0.3)[0] < 0.2),
     })  # fmt: skip
     rows_csv(tmp_path / "hammer.csv", {
-        "time": t[:-late], "Hammer": 2.25e-3 * blow[late:], "Trigger": trigger[late:],
+        "time": t[:-late], "Hammer": 2.25e-3 * impact[late:], "Trigger": trigger[late:],
     })  # fmt: skip
     conversion, recording = imported(tmp_path, [tmp_path / "daq.csv", tmp_path / "hammer.csv"], text)
     zero_s = conversion.document["zero_s"]
@@ -692,10 +692,10 @@ def test_a_hammer_pulse_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
     assert experiment.begin is not None
     assert (experiment.first_s, experiment.begin.tick) == (0.0, 0)
     (timed,) = experiment.scene.commands
-    blow = timed.request.model_dump()
+    impact = timed.request.model_dump()
     assert timed.at_s == pytest.approx(0.25, abs=2e-4)
-    assert blow["force_n"] == pytest.approx(87.0, rel=0.01)
-    assert blow["duration_ms"] == pytest.approx(6.5, rel=0.02)
+    assert impact["force_n"] == pytest.approx(87.0, rel=0.01)
+    assert impact["duration_ms"] == pytest.approx(6.5, rel=0.02)
     assert experiment.scene.drive.speed_hz == pytest.approx(5.2)
     assert experiment.scene.set["contact.friction"] == 0.25
     assert experiment.scene.sensors.groups == ("probes", "drive", "hammer")

@@ -125,10 +125,10 @@ CASES = [
         "inside the ring (r0 = 0.926 mm)",
     ),
     scene("position is nan", '[initial]\nposition = "given"\ny_mm = nan', "initial.y_mm", "a finite number"),
-    scene("blow too hard", HAMMER + "force_n = 1e6", "force_n", "less than or equal to 1000"),
-    scene("blow too long", HAMMER + "duration_ms = 51", "duration_ms", "less than or equal to 50"),
-    scene("blow to nowhere", HAMMER + 'direction = "up"', "direction", "x, y, -x, -y, or an angle"),
-    scene("blow with a colour", HAMMER + "colour = 1", "colour", "such as command, force_n, duration_ms, direction"),
+    scene("impact too hard", HAMMER + "force_n = 1e6", "force_n", "less than or equal to 1000"),
+    scene("impact too long", HAMMER + "duration_ms = 51", "duration_ms", "less than or equal to 50"),
+    scene("impact to nowhere", HAMMER + 'direction = "up"', "direction", "x, y, -x, -y, or an angle"),
+    scene("impact with a colour", HAMMER + "colour = 1", "colour", "such as command, force_n, duration_ms, direction"),
     scene(
         "speed command above the drive's",
         '[[commands]]\nat_s = 0.1\ncommand = "speed"\nspeed_hz = 99',
@@ -454,7 +454,7 @@ def test_commands_that_are_not_possible_now_are_refused() -> None:
     with pytest.raises(InputError, match=r"^release must be given once"):
         simulation.submit("release", {})
     simulation.advance(5_000)
-    assert simulation.submit("hammer", {}) == 5_500, "the blow is over"
+    assert simulation.submit("hammer", {}) == 5_500, "the impact is over"
 
 
 @pytest.mark.parametrize("command", ["hammer", "release"])

@@ -212,8 +212,8 @@ def test_times_are_those_of_the_samples(run: Run) -> None:
 
 
 def test_events_and_edges(run: Run) -> None:
-    (blow,) = run.events
-    assert blow == {
+    (impact,) = run.events
+    assert impact == {
         "event": "hammer",
         "tick": 20_000,
         "time_s": 0.02,

@@ -92,9 +92,9 @@ def test_shipped_scenes_load_and_have_a_description(name: str) -> None:
 
 def test_hammer_scene_is_the_papers() -> None:
     scene = load_scene("hammer")
-    (blow,) = scene.commands
+    (impact,) = scene.commands
     assert scene.drive.speed_hz == 6.2
-    assert blow.request == HammerCommand(force_n=100.0, duration_ms=5.0, direction="x")
+    assert impact.request == HammerCommand(force_n=100.0, duration_ms=5.0, direction="x")
 
 
 def test_a_scene_file_has_a_name_and_flat_commands(tmp_path: Path) -> None:
@@ -199,15 +199,15 @@ def test_points_of_a_profile_may_have_the_minimum_distance() -> None:
     assert len(parse_scene({"drive": {"profile": profile}}).drive.profile) == 100
 
 
-BLOW = {"command": "hammer", "duration_ms": 5.0}
+IMPACT = {"command": "hammer", "duration_ms": 5.0}
 RELEASE = {"command": "release"}
 
 
 @pytest.mark.parametrize(
     ("commands", "field"),
     [
-        ([{"at_s": 0.1, **BLOW}, {"at_s": 0.1, **BLOW}], "hammer"),
-        ([{"at_s": 0.104, **BLOW}, {"at_s": 0.1, **BLOW}], "hammer"),
+        ([{"at_s": 0.1, **IMPACT}, {"at_s": 0.1, **IMPACT}], "hammer"),
+        ([{"at_s": 0.104, **IMPACT}, {"at_s": 0.1, **IMPACT}], "hammer"),
         ([{"at_s": 0.1, **RELEASE}, {"at_s": 0.2, **RELEASE}], "release"),
     ],
 )

@@ -21,7 +21,7 @@ from drivers.can.bus.model import BusModel
 from drivers.can.bus.results import STATES
 from rig.base.errors import InputError, Words
 
-WINDOW = 512
+QUEUE_FRAMES = 512
 """Transmit queue of one endpoint [frames]; frames beyond it are dropped and counted."""
 MAX_ENDPOINTS = 64
 """Largest number of endpoints of other processes; those of this process are always admitted."""
@@ -72,11 +72,11 @@ class Endpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Local:
+class LocalEndpoint:
     """An endpoint of this process: callbacks for messages of the bus and for the end of the hub."""
 
-    take: Callable[[codec.HubMessage], None]
-    lost: Callable[[], None]
+    on_message: Callable[[codec.HubMessage], None]
+    on_close: Callable[[], None]
     secret: str
 
 
@@ -97,7 +97,7 @@ class Endpoints:
         self._by_node: dict[int, Endpoint] = {}
         self.numbers = np.full(256, codec.NO_NODE, np.uint16)
         """Number on the bus by number in the model."""
-        self.locals: dict[str, Local] = {}
+        self.locals: dict[str, LocalEndpoint] = {}
         self.tokens: dict[str, None] = {}
         """Tokens, the newest last."""
         self.waiting = 0
@@ -113,10 +113,10 @@ class Endpoints:
 
     # ---- joining and leaving ----
 
-    def connect(self, name: str, take: Callable[[codec.HubMessage], None], lost: Callable[[], None]) -> str:
+    def connect(self, name: str, on_message: Callable[[codec.HubMessage], None], on_close: Callable[[], None]) -> str:
         """Register an endpoint of this process before it joins, and return its secret."""
         secret = _new_secret()
-        self.locals[name] = Local(take, lost, secret)
+        self.locals[name] = LocalEndpoint(on_message, on_close, secret)
         return secret
 
     def disconnect(self, name: str) -> None:
@@ -188,10 +188,10 @@ class Endpoints:
                 "endpoint", "unused, or accompanied by its secret (an endpoint of that name has joined)", name
             )
 
-    def watch(self, name: str, there: bool) -> None:
+    def record_token(self, name: str, present: bool) -> None:
         """Record that a token has appeared or disappeared."""
         self.tokens.pop(name, None)
-        if there:
+        if present:
             self.tokens[name] = None
             while len(self.tokens) > MAX_TOKENS:
                 del self.tokens[next(iter(self.tokens))]
@@ -205,7 +205,7 @@ class Endpoints:
             endpoint.left_s = time.monotonic()
             endpoint.token = False
 
-    def forget_gone(self) -> None:
+    def remove_departed(self) -> None:
         """Remove endpoints that have left and whose frames are finished, or have waited too long."""
         now_s = time.monotonic()
         for endpoint in self:
@@ -221,7 +221,7 @@ class Endpoints:
         self._detach(endpoint)
 
     def _attach(self, endpoint: Endpoint) -> None:
-        node = endpoint.node = self._model.attach(endpoint.name, queue=WINDOW, listen_only=endpoint.listen_only)
+        node = endpoint.node = self._model.attach(endpoint.name, queue=QUEUE_FRAMES, listen_only=endpoint.listen_only)
         self._by_node[node] = endpoint
         self.numbers[node] = endpoint.number
 
@@ -261,7 +261,7 @@ class Endpoints:
         """
         is_sendable = are_sendable(records, fd=self._model.speed.fd)
         good = records[is_sendable]
-        room = 0 if endpoint.listen_only else max(0, WINDOW - (endpoint.offered - endpoint.done))
+        room = 0 if endpoint.listen_only else max(0, QUEUE_FRAMES - (endpoint.offered - endpoint.done))
         accepted = resize_records(good[:room])
         accepted["node"], accepted["time_ns"] = endpoint.node, now_ns
         if due_ns is not None:
@@ -277,7 +277,7 @@ class Endpoints:
         endpoint.dropped += dropped
         return dropped > 0
 
-    def settle(self, results: np.ndarray) -> None:
+    def count_results(self, results: np.ndarray) -> None:
         """Count the frames that the model has finished, from an array of `drivers.can.bus.results.RESULT`."""
         finals = results if results["final"].all() else results[results["final"] != 0]
         for node, outcome in zip(finals["node"].tolist(), finals["outcome"].tolist(), strict=True):

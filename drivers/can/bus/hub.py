@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from drivers.can.bus import codec
-from drivers.can.bus.endpoints import WINDOW, Endpoints
+from drivers.can.bus.endpoints import QUEUE_FRAMES, Endpoints
 from drivers.can.bus.frame import CLASSIC_WIDTH, FD_WIDTH, join_records, pack_records, resize_records
 from drivers.can.bus.model import BusModel, warm_up
 from drivers.can.bus.results import OUTCOMES
@@ -125,7 +125,7 @@ class Hub(Closing):
             for name in codec.REQUESTS:
                 self._server.answer(codec.request_key(self.channel, name), partial(self.reply, name))
             self._server.on_failure(self._guard.record_failure)
-            self._server.watch(codec.node_key(self.channel, "*"), self.watch)
+            self._server.watch(codec.node_key(self.channel, "*"), self.record_token)
             self._server.subscribe_reports(
                 codec.offer_key(self.channel, "*"), lambda key, payload: self.offer(key.rpartition("/")[2], payload)
             )
@@ -144,7 +144,7 @@ class Hub(Closing):
         if self._thread.is_alive():
             self._thread.join(timeout=2.0)
         for local in locals_:
-            self._guard(local.lost)
+            self._guard(local.on_close)
 
     def __enter__(self) -> Self:
         self.start()
@@ -152,19 +152,19 @@ class Hub(Closing):
 
     # ---- endpoints ----
 
-    def connect(self, name: str, take: Callable[[codec.HubMessage], None], lost: Callable[[], None]) -> str:
+    def connect(self, name: str, on_message: Callable[[codec.HubMessage], None], on_close: Callable[[], None]) -> str:
         """Register an endpoint of this process before it joins.
 
         Args:
             name: Name of the endpoint.
-            take: Called with the messages of the bus, on the hub's thread; must not block.
-            lost: Called when the hub ends.
+            on_message: Called with the messages of the bus, on the hub's thread; must not block.
+            on_close: Called when the hub ends.
 
         Returns:
             The endpoint's secret.
         """
         with self._lock:
-            return self.endpoints.connect(name, take, lost)
+            return self.endpoints.connect(name, on_message, on_close)
 
     def disconnect(self, name: str) -> None:
         """Remove an endpoint of this process; the frames that it has offered are still sent."""
@@ -219,7 +219,7 @@ class Hub(Closing):
                 endpoint = self.endpoints.join(request)
                 # A new listener may not wait longer than for a tick.
                 self._wake.set()
-                bus = {"window": WINDOW, **self._bus(), "epoch_ns": self.epoch_ns}
+                bus = {"window": QUEUE_FRAMES, **self._bus(), "epoch_ns": self.epoch_ns}
                 return {"node": endpoint.number, "secret": endpoint.secret, **bus}
         if not isinstance(request, codec.FlushRequest):
             return self.status()
@@ -239,10 +239,10 @@ class Hub(Closing):
                 self._counts["refused"] += 1
             return wire.encode_document({"error": str(error), "field": error.field, "must": error.must})
 
-    def watch(self, key: str, there: bool) -> None:
+    def record_token(self, key: str, present: bool) -> None:
         """Record that the token of an endpoint of another process has appeared or disappeared."""
         with self._lock:
-            self.endpoints.watch(key.rpartition("/")[2], there)
+            self.endpoints.record_token(key.rpartition("/")[2], present)
         self._wake.set()
 
     def _bus(self) -> dict[str, Any]:
@@ -317,7 +317,7 @@ class Hub(Closing):
 
     def _take_results(self, results: np.ndarray) -> None:
         """Count finished frames, and queue those that the endpoints receive."""
-        self.endpoints.settle(results)
+        self.endpoints.count_results(results)
         records = results["frame"].view(codec.RECORDS[FD_WIDTH])
         records["time_ns"] += np.uint64(self.epoch_ns)
         records["node"] = self.endpoints.numbers[results["node"]]
@@ -361,7 +361,7 @@ class Hub(Closing):
     def _reports(self, now: int) -> list[codec.NodeReport]:
         """Return the reports that have changed, after removing endpoints that have left."""
         found = []
-        self.endpoints.forget_gone()
+        self.endpoints.remove_departed()
         for endpoint in self.endpoints:
             report = self.endpoints.report(endpoint)
             before, endpoint.reported = endpoint.reported, report
@@ -392,7 +392,7 @@ class Hub(Closing):
             payload = codec.encode(messages) if isinstance(messages, np.ndarray) else codec.encode_reports(messages)
             self._guard(self._server.publish, codec.bus_key(self.channel), payload)
         for local in list(self.endpoints.locals.values()):
-            self._guard(local.take, messages)
+            self._guard(local.on_message, messages)
 
     def status(self) -> dict[str, Any]:
         """Return the state of the bus: load, counts, endpoints, warnings."""

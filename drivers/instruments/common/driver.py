@@ -114,14 +114,14 @@ class Instrument(Closing):
         """Close the link; further calls have no effect."""
         self.link.close()
 
-    def _act(self, act: protocol.Act) -> CommandDone:
+    def _send_command(self, command: protocol.InstrumentCommand) -> CommandDone:
         """Send a command.
 
         Raises:
             RefusedError: The instrument refused the command, for the reason in the message.
             LinkError: No reply came; the command may or may not take effect.
         """
-        done = self.ask(act, protocol.Done)
+        done = self.ask(command, protocol.Done)
         return CommandDone(id=done.id, tick=done.tick, time_s=done.time_s)
 
     def ask(self, request: InstrumentMessage, expected: type[M]) -> M:

@@ -47,7 +47,7 @@ class ProtocolError(ValueError):
         super().__init__(text)
 
 
-class Tail:
+class VariableField:
     """Type of a message's last field if its length varies: it extends to the end of the message."""
 
     TEXT = "text"
@@ -60,7 +60,7 @@ class InstrumentMessage:
 
     KIND: ClassVar[int] = 0
     LAYOUT: ClassVar[str] = "<"
-    TAIL: ClassVar[str | None] = None
+    LAST_FIELD: ClassVar[str | None] = None
 
 
 # ---- requests, from the host ----
@@ -111,7 +111,7 @@ class Stop(InstrumentMessage):
 
 
 @dataclass(frozen=True, slots=True)
-class Act(InstrumentMessage):
+class InstrumentCommand(InstrumentMessage):
     """Base of an instrument's commands; kinds from 0x40 on, which differ between instruments.
 
     Its fields are those of the rig's command `COMMAND`; a field that accepts a word or a number is sent as text.
@@ -128,7 +128,7 @@ class Identity(InstrumentMessage):
     """Reply with the datasheet (`drivers.instruments.common.datasheet`) as JSON."""
 
     KIND = 0x81
-    TAIL = Tail.TEXT
+    LAST_FIELD = VariableField.TEXT
     datasheet: str
 
 
@@ -179,7 +179,7 @@ class Refused(InstrumentMessage):
 
     KIND = 0x86
     LAYOUT = "<B"
-    TAIL = Tail.TEXT
+    LAST_FIELD = VariableField.TEXT
     reason: int
     text: str
 
@@ -203,7 +203,7 @@ class Rows(InstrumentMessage):
 
     KIND = 0xC1
     LAYOUT = "<IqqddB"
-    TAIL = Tail.COUNTS
+    LAST_FIELD = VariableField.COUNTS
     stream: int
     index: int
     tick: int
@@ -222,7 +222,7 @@ class Ended(InstrumentMessage):
 
     KIND = 0xC2
     LAYOUT = "<I"
-    TAIL = Tail.TEXT
+    LAST_FIELD = VariableField.TEXT
     stream: int
     reason: str
 
@@ -238,22 +238,22 @@ class Codec:
 
     Args:
         address: Name and number of the instrument.
-        acts: Classes of its commands.
+        commands: Classes of its commands.
     """
 
-    def __init__(self, address: Address, acts: tuple[type[Act], ...] = ()) -> None:
+    def __init__(self, address: Address, commands: tuple[type[InstrumentCommand], ...] = ()) -> None:
         self.address = address
-        self.acts = acts
-        self.kinds = {each.KIND: (each, struct.Struct(each.LAYOUT)) for each in (*COMMON_MESSAGES, *acts)}
+        self.commands = commands
+        self.kinds = {each.KIND: (each, struct.Struct(each.LAYOUT)) for each in (*COMMON_MESSAGES, *commands)}
 
     def encode(self, message: InstrumentMessage, sequence: int) -> bytes:
         """Encode one message."""
         kind, layout = self.kinds[message.KIND]
         values = [getattr(message, each.name) for each in dataclasses.fields(kind)]
         tail = b""
-        if kind.TAIL == Tail.TEXT:
+        if kind.LAST_FIELD == VariableField.TEXT:
             tail = str(values.pop()).encode()
-        elif kind.TAIL == Tail.COUNTS:
+        elif kind.LAST_FIELD == VariableField.COUNTS:
             tail = np.ascontiguousarray(values.pop(), _COUNTS).tobytes()
         head = HEAD.pack(VERSION, self.address.number, kind.KIND, sequence & 0xFFFFFFFF)
         return b"".join((head, layout.pack(*values), tail))
@@ -280,17 +280,17 @@ class Codec:
             raise error(Reason.KIND, f"kind must be a kind of the {self.address.name}; received {code:#04x}")
         kind, layout = self.kinds[code]
         start = HEAD.size + layout.size
-        if len(data) < start or (kind.TAIL is None and len(data) != start):
+        if len(data) < start or (kind.LAST_FIELD is None and len(data) != start):
             raise error(Reason.LENGTH, f"{kind.__name__} must be {start} bytes long; received {len(data)}")
         values: list[Any] = list(layout.unpack_from(data, HEAD.size))
         if any(isinstance(value, float) and not math.isfinite(value) for value in values):
             raise error(Reason.VALUE, f"{kind.__name__} must contain finite numbers; received {values}")
-        if kind.TAIL == Tail.TEXT:
+        if kind.LAST_FIELD == VariableField.TEXT:
             try:
                 values.append(data[start:].decode())
             except UnicodeDecodeError:
                 raise error(Reason.VALUE, f"text of {kind.__name__} must be UTF-8") from None
-        elif kind.TAIL == Tail.COUNTS:
+        elif kind.LAST_FIELD == VariableField.COUNTS:
             columns = int(values[-1])
             if not columns or (len(data) - start) % (columns * _COUNTS.itemsize):
                 raise error(Reason.LENGTH, f"{kind.__name__} must contain whole rows of {columns} values")

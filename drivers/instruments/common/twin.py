@@ -102,21 +102,22 @@ class Twin:
         self.refused += isinstance(reply, protocol.Refused)
         return self.CODEC.encode(reply, sequence)
 
-    def act(self, act: protocol.Act) -> Accepted:
+    def send_command(self, command: protocol.InstrumentCommand) -> Accepted:
         """Send a command of this instrument to the rig.
 
         Raises:
             InputError: The rig refused the command.
             NoReplyError: No rig replies.
         """
-        fields = {name: as_number(value) if isinstance(value, str) else value for name, value in asdict(act).items()}
-        return self._console.send(act.COMMAND, **fields)
+        values = asdict(command).items()
+        fields = {name: as_number(value) if isinstance(value, str) else value for name, value in values}
+        return self._console.send(command.COMMAND, **fields)
 
     def _execute(self, request: InstrumentMessage) -> InstrumentMessage:
         if isinstance(request, protocol.Identify):
             return protocol.Identity(self._datasheet().model_dump_json())
-        if isinstance(request, protocol.Act):
-            accepted = self.act(request)
+        if isinstance(request, protocol.InstrumentCommand):
+            accepted = self.send_command(request)
             return protocol.Done(id=accepted.id, tick=accepted.tick, time_s=accepted.time_s)
         if isinstance(request, protocol.Configure):
             return self._configure(request)
@@ -137,7 +138,7 @@ class Twin:
             title=self.TITLE if group is None else group.title,
             rate_hz=0 if group is None else group.rate_hz,
             channels=() if group is None else group.channels,
-            acts=tuple(act.__name__ for act in self.CODEC.acts),
+            acts=tuple(command.__name__ for command in self.CODEC.commands),
         )
 
     def _read_group(self) -> Group:

@@ -22,7 +22,7 @@ class Drive(Sampler):
             RefusedError: The rig refused the command, for the reason in the message.
             LinkError: No reply came; the speed may or may not be set.
         """
-        return self._act(SetSpeed(speed_hz=float(hz)))
+        return self._send_command(SetSpeed(speed_hz=float(hz)))
 
 
 class AsyncDrive(AsyncSampler[Drive]):

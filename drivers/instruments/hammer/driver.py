@@ -24,7 +24,7 @@ class Hammer(Sampler):
             RefusedError: The rig refused the command, for the reason in the message.
             LinkError: No reply came; there may or may not be an impact.
         """
-        return self._act(Hit(force_n=float(force_n), duration_ms=float(duration_ms), direction=str(direction)))
+        return self._send_command(Hit(force_n=float(force_n), duration_ms=float(duration_ms), direction=str(direction)))
 
 
 class AsyncHammer(AsyncSampler[Hammer]):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.instruments.common.protocol import Act, Codec, Tail
+from drivers.instruments.common.protocol import Codec, InstrumentCommand, VariableField
 from drivers.link import Address
 
 
 @dataclass(frozen=True, slots=True)
-class Hit(Act):
+class Hit(InstrumentCommand):
     """Command to strike the shaft at the disk.
 
     Attributes:
@@ -21,7 +21,7 @@ class Hit(Act):
     KIND = 0x40
     COMMAND = "hammer"
     LAYOUT = "<dd"
-    TAIL = Tail.TEXT
+    LAST_FIELD = VariableField.TEXT
     force_n: float
     duration_ms: float
     direction: str

@@ -19,7 +19,7 @@ class Magnet(Instrument):
             RefusedError: The rig refused the command, for the reason in the message.
             LinkError: No reply came; the shaft may or may not be released.
         """
-        return self._act(Release())
+        return self._send_command(Release())
 
 
 class AsyncMagnet(AsyncInstrument[Magnet]):

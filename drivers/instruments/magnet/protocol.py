@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.instruments.common.protocol import Act, Codec
+from drivers.instruments.common.protocol import Codec, InstrumentCommand
 from drivers.link import Address
 
 
 @dataclass(frozen=True, slots=True)
-class Release(Act):
+class Release(InstrumentCommand):
     """Command to release the shaft."""
 
     KIND = 0x40

@@ -24,7 +24,7 @@ from replays.campaigns.measurement import split_quantity
 from rig.base.checks import Written, build_read_error, check, open_file, parse_toml
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.channels.faults import find_channels, find_group
-from rig.channels.faults.blocks import OfBlocks
+from rig.channels.faults.blocks import BlockFault
 from rig.physics.kernels import signals
 from rig.run.commands.table import COMMANDS, FaultCommand, TimedCommand, check_command
 from rig.run.scenes import Scene, load_scene
@@ -412,7 +412,7 @@ class _Note(_Timed):
 def _check_fault(request: FaultCommand, field: str, scene: Scene, *, can: bool) -> None:
     what, setting = request.what, scene.setting
     try:
-        if isinstance(what, OfBlocks):
+        if isinstance(what, BlockFault):
             find_group(what, request.channel, scene.table, ("zenoh", "can") if can else ("zenoh",))
         else:
             find_channels(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from rig.base.errors import InputError, UnknownNameError
-from rig.channels.faults.blocks import DOORS, Message, OfBlocks, Restart
+from rig.channels.faults.blocks import TRANSPORTS, BlockFault, Message, Restart
 from rig.channels.faults.effect import check_draws, check_size, check_time
 from rig.channels.faults.kind import At, Draws, Kind, Setting, acts
 from rig.channels.faults.kinds import KINDS, AnyKind, NoFilter, Swap, connect_swaps
 from rig.channels.table import ChannelTable
 
 __all__ = [
-    "DOORS", "KINDS", "AnyKind", "At", "Draws", "Kind", "Message", "NoFilter", "OfBlocks", "Restart", "Setting",
+    "KINDS", "TRANSPORTS", "AnyKind", "At", "BlockFault", "Draws", "Kind", "Message", "NoFilter", "Restart", "Setting",
     "Swap", "acts", "check_draws", "check_size", "check_time", "connect_swaps", "describe_kinds",
     "find_channels", "find_group", "list_refusals",
 ]  # fmt: skip
@@ -55,7 +55,7 @@ def find_channels(
     Raises:
         InputError: The channel is unknown, or the kind is not supported on it; the message names what is required.
     """
-    if isinstance(what, OfBlocks):
+    if isinstance(what, BlockFault):
         return ()
     known = table.channels
     if target not in {*known, *table.groups}:
@@ -81,17 +81,17 @@ def find_channels(
     return names
 
 
-def find_group(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str, ...]) -> str:
+def find_group(what: BlockFault, target: str, table: ChannelTable, transports: tuple[str, ...]) -> str:
     """Return the group whose blocks a fault changes.
 
     Args:
         what: The fault.
         target: A group.
         table: Channel table.
-        doors: Outputs of the rig by which blocks are sent.
+        transports: Transports of the rig by which blocks are sent.
 
     Raises:
-        InputError: The group or the door is unknown; the message lists the known ones.
+        InputError: The group or the transport is unknown; the message lists the known ones.
     """
     known = list_refusals(type(what), table)
     if target in table.channels and target not in known:
@@ -99,15 +99,16 @@ def find_group(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[st
         raise InputError("fault.channel", must, target)
     if target not in known:
         raise UnknownNameError("fault.channel", f"one of the groups for {what.name()}", target, known)
-    if not set(what.doors) & set(doors):
-        raise InputError("door", f"one that this rig has: {', '.join(doors)} (a CAN bus: rig run --can)", what.door)
+    if not set(what.transports) & set(transports):
+        must = f"one that this rig has: {', '.join(transports)} (a CAN bus: rig run --can)"
+        raise InputError("door", must, what.door)
     if must := what.needs_at(what.door, target, tuple(known)):
         raise InputError("fault.channel", must, target)
     return target
 
 
 def describe_kinds(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[str, ...]]:  # noqa: B008
-    """Return each kind's name, stage, equation, numbers with defaults, supported channels or groups, and doors.
+    """Return each kind's name, stage, equation, numbers with defaults, supported channels or groups, and transports.
 
     Args:
         table: Channel table.
@@ -125,14 +126,14 @@ def describe_kinds(table: ChannelTable, setting: Setting = Setting()) -> list[tu
         many = "groups" if kind.of_blocks else "channels"
         where = f"all {len(on)} {many}" if len(on) == len(places) else ", ".join(on) or "none"
         doc = " ".join((kind.__doc__ or "").split())
-        doors = ", ".join(DOORS)
-        if issubclass(kind, OfBlocks):
+        transports = ", ".join(TRANSPORTS)
+        if issubclass(kind, BlockFault):
             groups = tuple(table.groups)
-            some = {door: [one for one in groups if not kind.needs_at(door, one, groups)] for door in DOORS}
-            doors += ", or one" + "".join(
+            some = {door: [one for one in groups if not kind.needs_at(door, one, groups)] for door in TRANSPORTS}
+            transports += ", or one" + "".join(
                 f" ({door} alone: {', '.join(there)})" for door, there in some.items() if len(there) < len(groups)
             )
-        found.append((name, kind.stage, doc, ", ".join(numbers) or "none", where, doors))
+        found.append((name, kind.stage, doc, ", ".join(numbers) or "none", where, transports))
     return found
 
 

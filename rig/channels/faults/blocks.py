@@ -1,4 +1,4 @@
-"""Kinds of faults of a group's blocks in transit, at one door of the rig or at all.
+"""Kinds of faults of a group's blocks in transit, on one transport of the rig or on all.
 
 While one acts, the rows of the stream are sent in blocks of block_s from its first row, whatever the lengths of frames.
 n is the number of such a block, and u(n) a uniform random number of the fault. Counts are never changed.
@@ -14,7 +14,7 @@ from pydantic import Field, FiniteFloat
 from rig.base.wire import Block
 from rig.channels.faults.kind import Kind
 
-DOORS = ("zenoh", "can")
+TRANSPORTS = ("zenoh", "can")
 """Outputs by which blocks leave the rig; a file written without pace has the blocks of the first."""
 MAX_DELAY_S = 10.0
 """Longest delay of a block [s]."""
@@ -29,7 +29,7 @@ class Message(NamedTuple):
         block: The block, with the number and the tick under which it is sent.
         row: True number of its first row.
         due: Time at which it is sent [ticks].
-        doors: Outputs by which it is sent.
+        transports: Transports by which it is sent.
         faults: Numbers of the faults that acted on it.
         after_others: Whether it is sent after others that are due at the same tick.
     """
@@ -38,12 +38,12 @@ class Message(NamedTuple):
     block: Block
     row: int
     due: int = 0
-    doors: tuple[str, ...] = DOORS
+    transports: tuple[str, ...] = TRANSPORTS
     faults: tuple[int, ...] = ()
     after_others: bool = False
 
 
-class OfBlocks(Kind):
+class BlockFault(Kind):
     """A fault of a stream's blocks."""
 
     stage = "wire"
@@ -52,9 +52,9 @@ class OfBlocks(Kind):
     block_s: Annotated[FiniteFloat, Field(ge=1e-3, le=1.0)] = 0.01
 
     @property
-    def doors(self) -> tuple[str, ...]:
-        """Doors at which it acts."""
-        return DOORS if self.door == "all" else (self.door,)
+    def transports(self) -> tuple[str, ...]:
+        """Transports on which it acts."""
+        return TRANSPORTS if self.door == "all" else (self.door,)
 
     @property
     def ticks(self) -> int:
@@ -63,7 +63,7 @@ class OfBlocks(Kind):
 
     @classmethod
     def needs_at(cls, door: str, group: str, groups: tuple[str, ...]) -> str:
-        """Return what a door requires in place of a group, out of all; empty if the fault shows there."""
+        """Return what a transport requires in place of a group, out of all; empty if the fault shows there."""
         return ""
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
@@ -77,7 +77,7 @@ class OfBlocks(Kind):
         raise NotImplementedError
 
 
-class Dropout(OfBlocks, number=30):
+class Dropout(BlockFault, number=30):
     """No block is sent; the row numbers continue."""
 
     kind: Literal["dropout"] = "dropout"
@@ -86,7 +86,7 @@ class Dropout(OfBlocks, number=30):
         return []
 
 
-class _Random(OfBlocks):
+class _Random(BlockFault):
     """A fault of randomly selected blocks."""
 
     part: PartOrAll = 0.1
@@ -125,7 +125,7 @@ class ReorderBlocks(_Random, number=33):
         return [message._replace(due=later, after_others=True) if u < self.part else message]
 
 
-class LateBlocks(OfBlocks, number=34):
+class LateBlocks(BlockFault, number=34):
     """Blocks are sent delay_s later, in their order; at its end all delayed blocks are sent."""
 
     kind: Literal["late-blocks"] = "late-blocks"
@@ -135,7 +135,7 @@ class LateBlocks(OfBlocks, number=34):
         return [message._replace(due=message.due + round(1e6 * self.delay_s))]
 
 
-class StaleStamps(OfBlocks, number=35):
+class StaleStamps(BlockFault, number=35):
     """All blocks have the time of the first row; row numbers continue. On CAN, Sync has this time, for one group."""
 
     kind: Literal["stale-stamps"] = "stale-stamps"
@@ -149,7 +149,7 @@ class StaleStamps(OfBlocks, number=35):
         return [message._replace(block=replace(message.block, tick=first[1]))]
 
 
-class Restart(OfBlocks, number=36):
+class Restart(BlockFault, number=36):
     """Row numbers and times begin again at 0: index' = index - that of the first row, and likewise for the tick."""
 
     kind: Literal["restart"] = "restart"

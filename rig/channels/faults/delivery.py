@@ -1,4 +1,4 @@
-"""Conversion of frames into messages: the source of blocks for all doors and recordings, where block faults act.
+"""Conversion of frames into messages: the source of blocks for all transports and recordings, where block faults act.
 
 A stream without a fault passes unchanged. Rows of a faulty stream are gathered into the blocks of its faults, on a
 fixed grid of time, so that the messages do not depend on the length of a frame. Documents for `rig.base.wire.FAULTS`
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rig.base.wire import EDGES, Block, sensor_key, truth_key
-from rig.channels.faults import Draws, Kind, Message, OfBlocks
+from rig.channels.faults import BlockFault, Draws, Kind, Message
 from rig.channels.sampling import TICKS_HZ, first_row
 
 _NO_TICK = 1 << 62
@@ -56,7 +56,7 @@ class Frame:
         """Return keys and blocks as published by zenoh."""
         if self.sent is None:
             return self._blocks()
-        return ((message.key, message.block) for message in self.sent if "zenoh" in message.doors)
+        return ((message.key, message.block) for message in self.sent if "zenoh" in message.transports)
 
     def _blocks(self) -> Iterator[tuple[str, Block]]:
         for group, block in self.samples.items():
@@ -108,7 +108,7 @@ class _Held:
 
 
 class Sending:
-    """Blocks between the sensors and the doors.
+    """Blocks between the sensors and the transports.
 
     Attributes:
         active: Faults of blocks.
@@ -161,7 +161,7 @@ class Sending:
             here = [one for one in faults if one.begin <= now < one.end]
             ends = [tick for one in faults for tick in (one.begin, one.end) if not math.isinf(tick)]
             for one in here:
-                assert isinstance(one.what, OfBlocks)
+                assert isinstance(one.what, BlockFault)
                 length = one.what.ticks
                 ends.append(one.begin + ((now - one.begin) // length + 1) * length)
             due = min((int(tick) for tick in ends if first_row(int(tick), rate) > row), default=None)
@@ -181,26 +181,26 @@ def _apply_faults(message: Message, faults: list[Active]) -> list[_Held]:
     found = [_Held(message)]
     now = message.row * TICKS_HZ // round(message.block.rate_hz)
     for one in faults:
-        assert isinstance(one.what, OfBlocks)
+        assert isinstance(one.what, BlockFault)
         row = first_row(one.begin, round(message.block.rate_hz))
         first = row, round(row * TICKS_HZ / message.block.rate_hz)
         u = float(one.draws[""].uniform(np.array([(now - one.begin) // one.what.ticks]))[0, 0])
-        before, found = found, []
+        before, found, targets = found, [], one.what.transports
         for held in before:
             inside, outside = (
-                tuple(door for door in held.message.doors if (door in one.what.doors) == acts) for acts in (True, False)
+                tuple(each for each in held.message.transports if (each in targets) == acts) for acts in (True, False)
             )
             if outside:
-                found.append(replace(held, message=held.message._replace(doors=outside)))
+                found.append(replace(held, message=held.message._replace(transports=outside)))
             if inside:
-                results = one.what.sent(held.message._replace(doors=inside), u, first)
+                results = one.what.sent(held.message._replace(transports=inside), u, first)
                 found += [_Held(each, (*held.by, one) if each.due != held.message.due else held.by) for each in results]
     return found
 
 
 def _describe_blocks(piece: Block, key: str, faults: list[Active], results: list[_Held]) -> dict[str, Any]:
     sent = [
-        {"index": each.block.index, "tick": each.block.tick, "due": each.due, "doors": list(each.doors)}
+        {"index": each.block.index, "tick": each.block.tick, "due": each.due, "doors": list(each.transports)}
         for each in (held.message for held in results)
     ]
     return {

@@ -8,7 +8,7 @@ from typing import Annotated, Any, get_args
 import typer
 
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.channels.faults import KINDS, OfBlocks
+from rig.channels.faults import KINDS, BlockFault
 from rig.cli.connections.connection import Connection, show
 from rig.cli.groups import panel
 from rig.cli.output.tables import Form, echo, echo_json, new_table
@@ -42,7 +42,7 @@ def _options() -> dict[str, Any]:
         words = get_args(hint) if field == "door" else ()
         values = {None if each.is_required() else each.default for each in own.values()}
         default = "" if len(values) > 1 or None in values else f"; default {values.pop()}"
-        kinds = "all kinds of blocks" if field in OfBlocks.model_fields else ", ".join(own)
+        kinds = "all kinds of blocks" if field in BlockFault.model_fields else ", ".join(own)
         text = f"{texts.get(field, field)} ({kinds}{default})"
         option = _parameters(text, metavar="|".join(words) or ("CHANNEL" if hint is str else "X"))
         found[field] = Annotated[str | None if words or hint is str else float | None, option]
@@ -125,7 +125,8 @@ def _show_kinds(channel: str | None, form: Form) -> None:
     if form.as_json:
         echo_json([dict(zip(headings, row, strict=True)) for row in rows])
         return
-    table_shown = new_table("", *headings, wrapped=("what it does", "numbers"), spare=("at", "on", "stage"))
+    shown = ("kind", "stage", "effect", "parameters", "channels", "transports")
+    table_shown = new_table("", *shown, wrapped=("effect", "parameters"), spare=("transports", "channels", "stage"))
     for row in rows:
         table_shown.add_row(*row)
     form.console().print(table_shown)

@@ -301,17 +301,17 @@ def events_table(events: list[dict[str, Any]]) -> Table:
     """Return a table of the events; a command and its effect share one row, with the sender."""
     from recorder.files.schemas import event_text
 
-    def of(event: dict[str, Any], name: str) -> tuple[str, str]:
+    def event_key(event: dict[str, Any], name: str) -> tuple[str, str]:
         return str(event.get("tick")), str(event.get(name))
 
-    effects = {of(event, "event") for event in events}
+    effects = {event_key(event, "event") for event in events}
     commands_by_effect: dict[tuple[str, str], list[dict[str, Any]]] = {}
     table = new_table("", ">time [s]", "event", wrapped=["event"])
     for event in events:
-        if event.get("event") == "command" and of(event, "command") in effects:
-            commands_by_effect.setdefault(of(event, "command"), []).append(event)
+        if event.get("event") == "command" and event_key(event, "command") in effects:
+            commands_by_effect.setdefault(event_key(event, "command"), []).append(event)
             continue
-        if commands := commands_by_effect.get(of(event, "event")):
+        if commands := commands_by_effect.get(event_key(event, "event")):
             event = event | {name: value for name, value in commands.pop(0).items() if name in ("id", "from")}
         time_s = event.get("time_s")
         stamp = f"{time_s:.4f}" if isinstance(time_s, float | int) else ""

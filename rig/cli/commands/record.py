@@ -37,7 +37,7 @@ class WhenFull(StrEnum):
     REMOVE_OLDEST = "remove-oldest"
 
 
-class Again(StrEnum):
+class RetriggerAction(StrEnum):
     """Effect of a trigger during a capture."""
 
     EXTEND = "extend"
@@ -79,7 +79,7 @@ class Triggers:
     longest_s: Annotated[float | None, _triggers("Longest capture in s of simulated time", show_default="60")] = None
     trigger_count: Annotated[int | None, _triggers("Stop after this number of captures")] = None
     again: Annotated[
-        Again | None,
+        RetriggerAction | None,
         _triggers(
             "Effect of a trigger during a capture",
             show_default="extend for events, ignore for levels",
@@ -98,7 +98,7 @@ class Triggers:
             "pre_s": self.pre_s,
             "post_s": self.post_s,
             "count": self.trigger_count,
-            "again": None if self.again is None else Again(self.again).value,
+            "again": None if self.again is None else RetriggerAction(self.again).value,
             "longest_s": self.longest_s,
         }
         given = {name: value for name, value in around.items() if value is not None}
@@ -172,7 +172,7 @@ def record(
 
     limits, capture = disk.limits(rotation), triggers.capture()
 
-    def session_of(client: ZenohClient | None) -> RecordingSession:
+    def create_session(client: ZenohClient | None) -> RecordingSession:
         return RecordingSession(
             client,  # type: ignore[arg-type]  # None in the first call, which only checks the options
             output,
@@ -187,9 +187,9 @@ def record(
             inbox_bytes=round(disk.backlog_mb * MB),
         )
 
-    session_of(None)  # checks the options before it connects
+    create_session(None)  # checks the options before it connects
     with connection.client() as client:
-        summary = run_session(session_of(client))
+        summary = run_session(create_session(client))
     print_result(summary)
     if not summary.good:
         raise typer.Exit(1)
@@ -206,7 +206,7 @@ def run_session(session: RecordingSession) -> Summary:
         for ending in ends:
             signal.signal(ending, before[ending])
 
-    def remark(lines: tuple[str, ...]) -> None:
+    def print_remarks(lines: tuple[str, ...]) -> None:
         nonlocal printed_count
         for line in lines[printed_count:]:
             console.print(line, soft_wrap=True)
@@ -226,7 +226,7 @@ def run_session(session: RecordingSession) -> Summary:
                     into = printable(" or ".join(map(str, files))) + more
                     echo(f"rig: recording {into}; Ctrl-C ends it well", err=True)  # scripts wait for this line
                 has_begun = has_begun or progress.rows > 0
-                remark(progress.remarks)
+                print_remarks(progress.remarks)
                 lost = f"{progress.lost} lost"
                 parts = [
                     f"{name}: {progress.time_s:.1f} s",
@@ -241,7 +241,7 @@ def run_session(session: RecordingSession) -> Summary:
                 status.update(line)
 
             summary = session.run(show)
-            remark(summary.remarks)
+            print_remarks(summary.remarks)
             return summary
     finally:
         for number in ends:

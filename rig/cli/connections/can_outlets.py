@@ -66,8 +66,8 @@ class CanOutlets:
 
     def warnings(self) -> list[str]:
         """Return the current warnings."""
-        doors = [*self._ports.values(), *([] if self._server is None else [self._server])]
-        return [text for door in doors for text in door.warnings()]
+        outlets = [*self._ports.values(), *([] if self._server is None else [self._server])]
+        return [text for outlet in outlets for text in outlet.warnings()]
 
     def dropped(self) -> int:
         """Return the number of frames dropped because clients read too slowly."""

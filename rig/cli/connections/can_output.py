@@ -168,8 +168,8 @@ class CanOutput:
         """Return a server that serves both the rig's transport and the bus."""
         from rig.serve.transport.fanout import Fanout
 
-        doors: dict[str, Server] = {"zenoh": server, "can": self._memory}
-        return Fanout([*doors.values()], doors=doors, figures=self._figures, warnings=self._warnings)
+        transports: dict[str, Server] = {"zenoh": server, "can": self._memory}
+        return Fanout([*transports.values()], transports=transports, figures=self._figures, warnings=self._warnings)
 
     def start(self, *, paced: bool) -> None:
         """Start the gateway; call it once the rig answers requests.

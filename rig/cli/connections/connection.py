@@ -161,7 +161,7 @@ def show(accepted: Accepted, what: str) -> None:
 
 
 def serve(
-    create_keys: Callable[[Server], ServedRun],
+    create_run: Callable[[Server], ServedRun],
     words: Callable[[dict[str, Any]], list[str]],
     print_summary: Callable[[dict[str, Any]], None],
     *,
@@ -173,7 +173,7 @@ def serve(
     """Serve a run to its end; exit status 1 if something failed without ending the run.
 
     Args:
-        create_keys: Creates the run on a server.
+        create_run: Creates the run on a server.
         words: Returns the parts of a progress line from a status.
         print_summary: Prints the summary.
         serving: Addresses to serve at.
@@ -192,7 +192,7 @@ def serve(
         bus or nullcontext(),
     ):
         with reduce_garbage_collections():
-            run = create_keys(server if bus is None else bus.join_server(server))
+            run = create_run(server if bus is None else bus.join_server(server))
             run.prepare()
             if bus is not None:
                 bus.start(paced=paced)
@@ -215,8 +215,8 @@ def print_addresses(server: ZenohServer, exposed: Exposure | None, name: str | N
         echo(f"rig: exposed at {exposed.endpoint} to holders of certificates (permissions: rig keys)", err=True)
         echo(f"rig: certificate of the rig: {own}", err=True)
     elif exposed is not None:
-        doors = ", ".join(permission.title for permission in (*ROLES["operator"], TRUTH))
+        permissions = ", ".join(permission.title for permission in (*ROLES["operator"], TRUTH))
         echo(f"rig: WARNING: {exposed.endpoint} is open to every client, unencrypted:", err=True)
-        echo(f"rig: WARNING: {doors}", err=True)
+        echo(f"rig: WARNING: {permissions}", err=True)
     name_text = "" if name is None else f" as {name}"
     echo(f"rig: listening on {server.endpoint}{name_text}; Ctrl-C or `rig stop` ends it", err=True)

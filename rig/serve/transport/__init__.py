@@ -116,6 +116,6 @@ class Client(Protocol):
         ...
 
 
-def get_doors(server: Server) -> dict[str, Server]:
+def get_transports(server: Server) -> dict[str, Server]:
     """Return the transports of a rig, by "zenoh" and "can"."""
-    return getattr(server, "doors", {"zenoh": server})
+    return getattr(server, "transports", {"zenoh": server})

@@ -13,7 +13,7 @@ class Fanout:
 
     Args:
         servers: The transports, in the order of publishing; the caller closes them.
-        doors: The transports by name.
+        transports: The transports by name.
         figures: Returns further counters for the status, as `congestion` does.
         warnings: Returns further current warnings.
     """
@@ -22,12 +22,12 @@ class Fanout:
         self,
         servers: Sequence[Server],
         *,
-        doors: Mapping[str, Server] | None = None,
+        transports: Mapping[str, Server] | None = None,
         figures: Callable[[], dict[str, float]] | None = None,
         warnings: Callable[[], list[str]] = list,
     ) -> None:
         self._servers = tuple(servers)
-        self.doors = dict(doors or {"zenoh": self._servers[0]})
+        self.transports = dict(transports or {"zenoh": self._servers[0]})
         self.warnings = warnings
         self._figures = figures
 
