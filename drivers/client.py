@@ -136,10 +136,10 @@ class Rig(Console):
         stream = RigStream(client, on_event=self._on_event)
         self._truth: dict[str, RowReader] = {}
         for table in truth:
-            known = document.get("truth", {})
-            if table not in known:
-                raise UnknownNameError("truth", "one of the rig's tables", table, known)
-            self._truth[table] = _read_truth(stream, table, known[table]["columns"])
+            tables = document.get("truth", {})
+            if table not in tables:
+                raise UnknownNameError("truth", "one of the rig's tables", table, tables)
+            self._truth[table] = _read_truth(stream, table, tables[table]["columns"])
         self._daq: Daq | None = None
         if channels:
             source = source or RigSource(client, stream=stream)
@@ -250,11 +250,11 @@ class Rig(Console):
             raise InputError("within_s", "a time above 0", within_s)
         if piece_s is None:
             piece_s = self._block_ticks / self._tick_rate_hz if self._is_stepper else 0.05
-        left, piece = max(1, round(within_s * rate)), max(1, round(piece_s * rate))
+        remaining, piece = max(1, round(within_s * rate)), max(1, round(piece_s * rate))
         first_s = last_s = None
-        while left > 0:
-            samples = self._read_rows(min(piece, left), whole=False)
-            left -= len(samples)
+        while remaining > 0:
+            samples = self._read_rows(min(piece, remaining), whole=False)
+            remaining -= len(samples)
             first_s = samples.times_s[0] if first_s is None else first_s
             last_s = samples.times_s[-1]
             met = np.asarray(condition(samples))

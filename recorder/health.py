@@ -181,7 +181,7 @@ class _GroupStatistics:
         self.flush()
         levels = np.concatenate(self._levels) if self._levels else np.full((1, len(self._group.channels)), np.nan)
         quiet = np.percentile(levels, 10.0, axis=0)
-        found = []
+        results = []
         for column, channel in enumerate(self._group.channels):
             scale, offset = channel.scale, channel.offset
             ends = sorted((self._low[column] * scale + offset, self._high[column] * scale + offset))
@@ -198,8 +198,8 @@ class _GroupStatistics:
                 stuck_s=float(self._longest[column] - 1) / self._group.rate_hz,
             )
             self._add_findings(health, channel, column, spin_hz)
-            found.append(health)
-        return found
+            results.append(health)
+        return results
 
     def _add_findings(self, health: ChannelHealth, channel: Channel, column: int, spin_hz: float) -> None:
         report = health.findings.append

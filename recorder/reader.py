@@ -125,10 +125,10 @@ class Recording:
     def commands(self) -> list[dict[str, Any]]:
         """Commands received by the rig, including those before the recording: id, tick, command, request."""
         declared = [*self.scene.get("taken", []), *(event for event in self.events if event.get("event") == "command")]
-        found = {
+        commands = {
             entry["id"]: {name: entry[name] for name in ("id", "tick", "command", "request")} for entry in declared
         }
-        return [found[number] for number in sorted(found)]
+        return [commands[number] for number in sorted(commands)]
 
     @cached_property
     def last_status(self) -> dict[str, Any] | None:
@@ -146,8 +146,8 @@ class Recording:
     @cached_property
     def timed_gaps(self) -> list[tuple[float, Gap]]:
         """Gaps with the simulated time at which each was noted [s]."""
-        found = self._documents(schemas.GAPS)
-        return [(time_ns / 1e9, Gap(gap["key"], gap["index"], gap["size"])) for time_ns, gap in found]
+        documents = self._documents(schemas.GAPS)
+        return [(time_ns / 1e9, Gap(gap["key"], gap["index"], gap["size"])) for time_ns, gap in documents]
 
     @cached_property
     def clock(self) -> np.ndarray:
@@ -200,8 +200,8 @@ class Recording:
         if self.in_part:
             return ()
         names = [""] if len(self.parts) == 1 else [f"{part.path.name}: " for part in self.parts]
-        found = zip(names, self._surveyed(), strict=True)
-        return tuple(name + text for name, survey in found for text in what(survey))
+        surveys = zip(names, self._surveyed(), strict=True)
+        return tuple(name + text for name, survey in surveys for text in what(survey))
 
     def samples(self, *names: str) -> Samples:
         """Return sensor channels in engineering units, shape (n, channels).
@@ -228,17 +228,17 @@ class Recording:
 
     def _group(self, name: str) -> Samples:
         group = self.table.groups[name]
-        found = build_samples(
+        samples = build_samples(
             self.blocks(sensor_key(name)),
             name=name,
             names=group.names,
             units=tuple(channel.unit for channel in group.channels),
             rate_hz=float(group.rate_hz),
         )
-        values = found.values  # convert in place: may be gigabytes
+        values = samples.values  # convert in place: may be gigabytes
         values *= np.array([channel.scale for channel in group.channels])
         values += np.array([channel.offset for channel in group.channels])
-        return found
+        return samples
 
     def truth(self, table: str) -> Samples:
         """Return a truth table in order of arrival.
@@ -276,8 +276,8 @@ class Recording:
         for key in keys:
             if get_schema(key) is None:
                 raise InputError("key", "a key of blocks (sensors or truth)", key)
-        found = self._blocks_as_sent(keys)
-        return sort_blocks(found) if self.true else found
+        blocks = self._blocks_as_sent(keys)
+        return sort_blocks(blocks) if self.true else blocks
 
     def _blocks_as_sent(self, keys: set[str]) -> Iterator[tuple[str, Block]]:
         declared = Declared() if self.true else None
@@ -290,9 +290,9 @@ class Recording:
 
     def with_true_blocks(self) -> Self:
         """Return the recording with reported block faults reversed: each block once, in order, at its own time."""
-        found = copy(self)
-        found.true = FAULTS in self.messages
-        return found
+        recording = copy(self)
+        recording.true = FAULTS in self.messages
+        return recording
 
     def between(self, from_s: float, to_s: float) -> Self:
         """Return the recording limited to the rows between two times [s]; see `RecordingFile.between`.
@@ -302,16 +302,16 @@ class Recording:
         """
         if math.isinf(from_s) and math.isinf(to_s):
             return self
-        found = type(self)(tuple(part.between(from_s, to_s) for part in self.parts))
-        found.true, found.applies_faults, found.in_part = self.true, self.applies_faults, True
-        return found
+        recording = type(self)(tuple(part.between(from_s, to_s) for part in self.parts))
+        recording.true, recording.applies_faults, recording.in_part = self.true, self.applies_faults, True
+        return recording
 
     def without_faults(self) -> Self:
         """Return the recording with its fault documents ignored; only `doubts` and `streams` differ."""
-        found = copy(self)
-        found.applies_faults = False
-        found.clear_surveys()
-        return found
+        recording = copy(self)
+        recording.applies_faults = False
+        recording.clear_surveys()
+        return recording
 
     def everything(self, topics: Container[str] | None = None) -> Iterator[Message]:
         """Yield every message in file order: topic, simulated time [ns], arrival time [unix ns] and payload.
@@ -374,8 +374,8 @@ def join(paths: list[Path], *, in_part: bool = False) -> Recording:
     surveys = sorted(map(Survey, parts), key=lambda survey: _extent_s(survey)[0])
     for earlier, later in pairwise(surveys):
         if _extent_s(later)[0] < _extent_s(earlier)[1]:
-            found = Words(f"{earlier.file.path} and {later.file.path}")
-            raise InputError("files", "recordings that do not overlap in time", found)
+            names = Words(f"{earlier.file.path} and {later.file.path}")
+            raise InputError("files", "recordings that do not overlap in time", names)
     return Recording(tuple(survey.file for survey in surveys), tuple(surveys))
 
 

@@ -355,10 +355,10 @@ def _select_columns(
     recording: Recording, channels: tuple[str, ...], only: str | None
 ) -> tuple[dict[str, Any], dict[str, list[int] | None]]:
     """Return the catalogue of a cut, and the columns to keep of each remaining key; None for all columns."""
-    known = recording.table.channels
+    table_channels = recording.table.channels
     for name in channels:
-        if name not in known:
-            raise InputError("channels", f"among {', '.join(known)}", name)
+        if name not in table_channels:
+            raise InputError("channels", f"among {', '.join(table_channels)}", name)
     keys = {key for key in recording.messages if get_schema(key) is not None}
     if only is not None:
         keys = {key for key in keys if key.startswith((SENSORS if only == "sensors" else TRUTH) + "/")}

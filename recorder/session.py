@@ -146,8 +146,8 @@ class RecordingSession:
             check_series(path, self._limits, force=force)
         else:
             for field in ("rotate_mb", "rotate_s"):
-                if (given := getattr(self._limits, field)) is not None:
-                    raise InputError(field, "omitted for a recording around triggers", given)
+                if (limit := getattr(self._limits, field)) is not None:
+                    raise InputError(field, "omitted for a recording around triggers", limit)
             check_captures(path, capture, self._limits, force=force)
         self.path = path
         self._client = client

@@ -112,7 +112,7 @@ def _targets(message: CanMessage) -> dict[int, str]:
 
 
 def _find_target(name: str, targets: dict[int, str]) -> int:
-    found = next((value for value, other in targets.items() if other == name), None)
-    if found is None:
+    target = next((value for value, other in targets.items() if other == name), None)
+    if target is None:
         raise UnknownNameError("fault.channel", "the name of a channel or channel group", name, targets.values())
-    return found
+    return target

@@ -167,9 +167,9 @@ class CanMessage:
             ValueError: A value does not fit its bits.
         """
         total = 0
-        known = {signal.name: signal for signal in self.signals}
+        signals = {signal.name: signal for signal in self.signals}
         for name, value in raw.items():
-            signal = known[name]
+            signal = signals[name]
             low, high = signal.raw_range
             if not low <= value <= high:
                 raise ValueError(f"{self.name}.{name} must be between {low} and {high}; received {value}")

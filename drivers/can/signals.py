@@ -288,7 +288,7 @@ def _fault_message(table: ChannelTable) -> CanMessage:
 
 
 def _fd_messages(table: ChannelTable) -> list[CanMessage]:
-    found, used_names = [], {row.name for row in _other_messages()}
+    messages, used_names = [], {row.name for row in _other_messages()}
     parts = [
         (group, group.channels[first : first + _FD_CHANNELS])
         for group in table.groups.values()
@@ -313,18 +313,18 @@ def _fd_messages(table: ChannelTable) -> list[CanMessage]:
         )
         index = "Number of the first instant in the recording, modulo 2^32; the others follow by Rates.fd_step"
         length = next(size for size in FD_LENGTHS[8:] if size >= 4 + 3 * rows * len(channels))
-        found.append(
+        messages.append(
             CanMessage(
                 name, 0x100 + spacing * position, length, True, rows / FD_HZ, True, RIG, label,
                 _sample_signals(samples, index), samples,
             )
         )  # fmt: skip
-    return found
+    return messages
 
 
 def _classic_messages(table: ChannelTable) -> list[CanMessage]:
     channels = tuple(table.channels.values())
-    found = []
+    messages = []
     for number, first in enumerate(range(0, len(channels), 3), start=1):
         samples = SampleLayout(channels[first : first + 3], 1, 2, 2)
         step = samples.channels[0].rate_hz // CLASSIC_HZ
@@ -334,13 +334,13 @@ def _classic_messages(table: ChannelTable) -> list[CanMessage]:
             "what lies above half the slower rate folds back"
         )
         index = "Number in the recording divided by Rates.classic_step, modulo 65536"
-        found.append(
+        messages.append(
             CanMessage(
                 f"Samples_{number}", 0x200 + number, 2 + 2 * len(samples.channels), False, 1.0 / CLASSIC_HZ, True, RIG,
                 label, _sample_signals(samples, index), samples,
             )
         )  # fmt: skip
-    return found
+    return messages
 
 
 def make_table(channels: ChannelTable) -> MessageTable:
@@ -360,10 +360,10 @@ def messages_for(channels: ChannelTable) -> MessageTable:
     return default_messages() if find_mismatch(channels, default_table().channels) is None else make_table(channels)
 
 
-def find_mismatch(channels: ChannelTable, known: Mapping[str, Channel]) -> str | None:
+def find_mismatch(channels: ChannelTable, calibrated: Mapping[str, Channel]) -> str | None:
     """Return the name of the first channel that is not known with the same calibration and unit."""
     for name, channel in channels.channels.items():
-        like = known.get(name)
+        like = calibrated.get(name)
         if like is None or (like.scale, like.offset, like.unit) != (channel.scale, channel.offset, channel.unit):
             return name
     return None

@@ -64,12 +64,12 @@ def act(machine: Any, settings: Settings, actions: Iterable[Action], show: Calla
 
 def _events(machine: Any) -> list[dict[str, Any]]:
     """Return the events since the last call."""
-    found = []
+    events = []
     try:
         while True:
-            found.append(machine.event(lambda _: True, timeout_s=0.0))
+            events.append(machine.event(lambda _: True, timeout_s=0.0))
     except TimeoutError:
-        return found
+        return events
 
 
 def parse(arguments: Sequence[str]) -> tuple[str, Settings]:

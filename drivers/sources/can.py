@@ -80,13 +80,13 @@ class SampleDecoder:
         span = form.rows * step
         self._expected[name] = int(numbers[-1]) + span
         engineering = form.engineering(values)
-        found = []
+        blocks = []
         for run in np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(numbers) != span) + 1):
             index = int(numbers[run[0]]) // step
             rows = engineering[run[0] * form.rows : (run[-1] + 1) * form.rows]
             first = -index % self._decimation
             if len(rows) > first:
-                found.append(
+                blocks.append(
                     Samples(
                         index=(index + first) // self._decimation,
                         tick=round((index + first) * step * _TICK_RATE_HZ / rate_hz),
@@ -97,7 +97,7 @@ class SampleDecoder:
                         values=rows[first :: self._decimation],
                     )
                 )
-        return found
+        return blocks
 
 
 def _unwrap_numbers(low_bits: np.ndarray, bits: int, near_index: int) -> np.ndarray:

@@ -205,8 +205,8 @@ class CanClient(Closing):
         if command == "clear":
             return clear_frame(counter, number=0 if fields["id"] == "all" else int(fields["id"]))
         if command.upper() not in CommandKind.__members__:
-            known = ", ".join(each.name.lower() for each in CommandKind)
-            raise InputError("command", f"one with a CAN frame ({known}, fault, clear)", command)
+            names = ", ".join(each.name.lower() for each in CommandKind)
+            raise InputError("command", f"one with a CAN frame ({names}, fault, clear)", command)
         return command_frame(CommandKind[command.upper()], counter, **fields)
 
     def _command(self, command: str, fields: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:

@@ -109,13 +109,13 @@ class ConsistencyCheck:
         if not self._imported and not self.replayed:
             self._check_table()
             self._check_run(filled)
-        found = [
+        contradictions = [
             f"{what}: {' but '.join(f'{_format_value(value)} in {where}' for where, value in _distinct_values(places))}"
             for what, places in self._values.items()
             if len(_distinct_values(places)) > 1
         ]
-        found += [f"messages of {key} with contradictory times: {n}" for key, n in self._mistimed.items() if n]
-        return [*found, *self._findings]
+        contradictions += [f"messages of {key} with contradictory times: {n}" for key, n in self._mistimed.items() if n]
+        return [*contradictions, *self._findings]
 
     def _state(self, what: str, **places: Any) -> None:
         """Add the value of a quantity at one or more places; None means that the place does not state it."""
@@ -381,10 +381,10 @@ def own_table(scene: Mapping[str, Any]) -> ChannelTable | None:
 
 def calibration_off(table: ChannelTable, own: ChannelTable) -> list[str]:
     """Return the differences between the channels of a recording and those of its scene's table, one line each."""
-    like, found = own.channels, list[str]()
+    like, differences = own.channels, list[str]()
     for name, channel in table.channels.items():
         if name not in like:
-            found.append(f"{name}: not in the channel table of its scene")
+            differences.append(f"{name}: not in the channel table of its scene")
             continue
         off = [
             f"{key} {getattr(channel, key)} instead of {getattr(like[name], key)}"
@@ -392,8 +392,8 @@ def calibration_off(table: ChannelTable, own: ChannelTable) -> list[str]:
             if getattr(channel, key) != getattr(like[name], key)
         ]
         if off:
-            found.append(f"{name}: {', '.join(off)}")
-    return found
+            differences.append(f"{name}: {', '.join(off)}")
+    return differences
 
 
 def _fill_defaults(name: str, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -407,11 +407,11 @@ def _fill_defaults(name: str, request: Mapping[str, Any]) -> dict[str, Any]:
 
 def _distinct_values(places: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Return each distinct value with the first place where it occurs."""
-    found: list[tuple[str, Any]] = []
+    distinct: list[tuple[str, Any]] = []
     for where, value in places.items():
-        if all(value != other for _, other in found):
-            found.append((where, value))
-    return found
+        if all(value != other for _, other in distinct):
+            distinct.append((where, value))
+    return distinct
 
 
 def _format_value(value: Any) -> str:

@@ -154,8 +154,8 @@ class Tally:
 
     def end(self, rows: dict[str, int]) -> list[Gap]:
         """Count the rows missing at the end of each stream as gaps and return the gaps; see `find_missing_rows`."""
-        found = [self._continuity.follow(key, end, 0) for key, end in self.find_missing_rows(rows).items()]
-        gaps = [gap for gap in found if gap is not None]
+        ends = [self._continuity.follow(key, end, 0) for key, end in self.find_missing_rows(rows).items()]
+        gaps = [gap for gap in ends if gap is not None]
         self.gaps += len(gaps)
         return gaps
 

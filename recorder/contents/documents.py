@@ -273,8 +273,8 @@ def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, A
 def parse_document(topic: str, payload: bytes) -> dict[str, Any] | None:
     """Return the document in a message of one of the topics in `KINDS`; None if it is invalid."""
     try:
-        document, found = read(KINDS[topic], payload, field=topic)
-        if isinstance(found, Event) and found.event == "command":
+        document, entry = read(KINDS[topic], payload, field=topic)
+        if isinstance(entry, Event) and entry.event == "command":
             read(Command, payload, field=topic)
     except InputError:
         return None

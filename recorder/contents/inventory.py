@@ -137,38 +137,38 @@ class Survey:
     def doubts(self) -> tuple[str, ...]:
         """Contradictions in a file whose checksums are all valid, one line each."""
         formats, messages = self.file.formats, self.file.messages
-        found = list(self.missing_rows)
+        doubts = list(self.missing_rows)
         for key, stream in self.streams.items():
             if stream.invalid:
-                found.append(f"payloads of {key} that are not blocks or do not fit the catalogue: {stream.invalid}")
+                doubts.append(f"payloads of {key} that are not blocks or do not fit the catalogue: {stream.invalid}")
             if stream.stepped_back:
-                found.append(f"blocks of {key} with repeated or decreasing row numbers: {stream.stepped_back}")
+                doubts.append(f"blocks of {key} with repeated or decreasing row numbers: {stream.stepped_back}")
             if stream.wrong_rate:
-                found.append(f"blocks of {key} whose rate differs from the catalogue: {stream.wrong_rate}")
+                doubts.append(f"blocks of {key} whose rate differs from the catalogue: {stream.wrong_rate}")
             if stream.misplaced:
                 wrong = (
                     "edges that are not in ascending order"
                     if key == EDGES
                     else "a time that does not fit their row number"
                 )
-                found.append(f"{stream.misplaced} blocks of {key} have {wrong}")
+                doubts.append(f"{stream.misplaced} blocks of {key} have {wrong}")
             if stream.rows > (stated := self.file.stated_rows.get(key, stream.rows)):
-                found.append(f"{key} has {stream.rows} rows, but the file states {stated}")
+                doubts.append(f"{key} has {stream.rows} rows, but the file states {stated}")
             if stream.rows and key not in formats:
-                found.append(f"{key} is not in the catalogue")
-        found += [f"malformed messages of {key}: {n}" for key, n in self._malformed.items()]
+                doubts.append(f"{key} is not in the catalogue")
+        doubts += [f"malformed messages of {key}: {n}" for key, n in self._malformed.items()]
         for topic in sorted(set(messages) | set(self._counted)):
             if (counted := self._counted.get(topic, 0)) != (stated := messages.get(topic, 0)):
-                found.append(f"{counted} messages of {topic}, but the file states {stated}")
+                doubts.append(f"{counted} messages of {topic}, but the file states {stated}")
         filled = {key: stream for key, stream in self.streams.items() if stream.rows}
         span_s = max((stream.last_time_s for stream in filled.values()), default=0.0)
         span_s -= min((stream.first_time_s for stream in filled.values()), default=0.0)
         for key in sorted(set(formats) - {EDGES} - set(filled)):
             if span_s > max(_MIN_SPAN_S, 2.0 / formats[key].rate_hz):
-                found.append(f"no rows of {key}, which is in the catalogue")
+                doubts.append(f"no rows of {key}, which is in the catalogue")
         sound = {key: self._steps.get(key, []) for key, stream in self.streams.items() if not stream.invalid}
-        found += self._consistency.find_contradictions(self.streams, sound)
-        return tuple(found)
+        doubts += self._consistency.find_contradictions(self.streams, sound)
+        return tuple(doubts)
 
     def _add_block(self, key: str, time_ns: int, payload: bytes) -> Block | None:
         stream = self.streams.setdefault(key, Stream())

@@ -42,22 +42,22 @@ class Commands:
 
     def __init__(self, scene: dict[str, Any]) -> None:
         self._scene = scene
-        self._taken = {entry.get("id"): entry for entry in scene.get("taken", [])}
+        self._commands = {entry.get("id"): entry for entry in scene.get("taken", [])}
 
     def follow(self, event: dict[str, Any] | None) -> None:
         """Add a command event to the scene; ignore all others."""
         if event is not None and event.get("event") == "command":
-            if len(self._taken) >= _MAX_COMMANDS:
-                self._taken.pop(next(iter(self._taken)))
+            if len(self._commands) >= _MAX_COMMANDS:
+                self._commands.pop(next(iter(self._commands)))
             fields = ("id", "tick", "command", "request")
-            self._taken.setdefault(event.get("id"), {name: event.get(name) for name in fields})
+            self._commands.setdefault(event.get("id"), {name: event.get(name) for name in fields})
 
     @property
     def scene(self) -> dict[str, Any]:
         """Scene document with all commands up to now."""
-        if not self._taken and "taken" not in self._scene:
+        if not self._commands and "taken" not in self._scene:
             return self._scene
-        return {**self._scene, "taken": list(self._taken.values())}
+        return {**self._scene, "taken": list(self._commands.values())}
 
 
 class Head:

@@ -66,31 +66,31 @@ class RecordingFile:
         with self._open() as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise InputError("file", _MUST_BE_RECORDING, Words(f"{path}, which is not an MCAP file"))
-            found = read_contents(file, path.stat().st_size, salvage=salvage, in_part=in_part)
-            self._take_metadata(found.metadata, found.attachments.get(COPY), salvage=salvage)
-        self.complete, self.unchecked = found.complete, found.unchecked
-        self.damaged += found.damaged
-        self.attachments, self.chunks, self._topics = found.attachments, tuple(found.chunks), found.topics
+            contents = read_contents(file, path.stat().st_size, salvage=salvage, in_part=in_part)
+            self._take_metadata(contents.metadata, contents.attachments.get(COPY), salvage=salvage)
+        self.complete, self.unchecked = contents.complete, contents.unchecked
+        self.damaged += contents.damaged
+        self.attachments, self.chunks, self._topics = contents.attachments, tuple(contents.chunks), contents.topics
         self.read_chunks: frozenset[int] | None = None
-        self.about, self.stated_rows, self.stated_begin_s = found.about, dict[str, int](), None
+        self.about, self.stated_rows, self.stated_begin_s = contents.about, dict[str, int](), None
         with contextlib.suppress(InputError):
-            stated = found.metadata.get("end", {}) if found.finished else {}
+            stated = contents.metadata.get("end", {}) if contents.finished else {}
             end = documents.read_metadata(documents.End, stated, field="end")
             self.stated_rows, self.stated_begin_s = read_json(end.rows.encode()), end.first_time_s
-        self.messages = {self._topics[number]: count for number, count in sorted(found.counts.items())}
+        self.messages = {self._topics[number]: count for number, count in sorted(contents.counts.items())}
         if len(set(self._topics.values())) < len(self._topics):
             raise InputError("file", "a recording with each channel once", str(path))
         self._check_documents(salvage=salvage)
 
-    def _take_metadata(self, found: dict[str, dict[str, str]], copy: bytes | None, *, salvage: bool) -> None:
+    def _take_metadata(self, metadata: dict[str, dict[str, str]], copy: bytes | None, *, salvage: bool) -> None:
         """Use the checksummed copy of the metadata where the file has one."""
-        self.damaged, self.metadata = 0, found
+        self.damaged, self.metadata = 0, metadata
         if copy is None:
             return
         stated = read_json(copy, field=COPY)
-        if {name: found.get(name) for name in stated} != stated:
+        if {name: metadata.get(name) for name in stated} != stated:
             self.damaged = 1
-        self.metadata = {**({"end": found["end"]} if "end" in found and not salvage else {}), **stated}
+        self.metadata = {**({"end": metadata["end"]} if "end" in metadata and not salvage else {}), **stated}
 
     def _check_documents(self, *, salvage: bool) -> None:
         """Validate metadata and attached documents."""
@@ -149,16 +149,16 @@ class RecordingFile:
         Chunks outside the interval are skipped by the index. A file with block faults is read completely, because the
         true times of its blocks depend on all of its fault documents.
         """
-        found = copy(self)
+        part = copy(self)
         if FAULTS in self.messages:
-            return found
+            return part
         begin_ns, end_ns = (from_s - _MAX_BLOCK_S) * 1e9, to_s * 1e9
         read_chunks = {each for each in self.chunks if each.end_ns >= begin_ns and each.begin_ns <= end_ns}
         latest: dict[int, Chunk] = {}  # a long earlier block may reach into the interval
         for chunk in sorted(set(self.chunks) - read_chunks, key=lambda each: each.begin_ns):
             latest |= dict.fromkeys(chunk.channels or () if chunk.begin_ns < from_s * 1e9 else (), chunk)
-        found.read_chunks = frozenset(each.offset for each in read_chunks | set(latest.values()))
-        return found
+        part.read_chunks = frozenset(each.offset for each in read_chunks | set(latest.values()))
+        return part
 
     def _topics_in(self, chunk: Chunk, wanted: dict[int, str]) -> dict[int, str]:
         """Return the requested topics to read in a chunk."""

@@ -128,9 +128,9 @@ class View:
             self._rows = JointStateRows(self.names, used)
         merged = {}
         for name in self.groups:
-            found = [part[name] for part in parts if name in part]
-            if found:
-                merged[name] = tuple(np.concatenate(columns) for columns in zip(*found, strict=True))
+            columns_by_part = [part[name] for part in parts if name in part]
+            if columns_by_part:
+                merged[name] = tuple(np.concatenate(columns) for columns in zip(*columns_by_part, strict=True))
         instants = next(iter(merged.values()))[0]
         if any(not np.array_equal(times_ns, instants) for times_ns, _ in merged.values()):
             instants = np.unique(np.concatenate([times_ns for times_ns, _ in merged.values()]))

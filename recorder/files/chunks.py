@@ -139,16 +139,16 @@ def _unpack_zstd(packed: bytes, size: int, cut: bool) -> bytes:
             return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
         except zstandard.ZstdError as error:
             raise DamagedError(str(error)) from None
-    found, length = [], 0
+    pieces, length = [], 0
     # Small pieces recover all compressed blocks before the point where the file ends.
     with (
         contextlib.suppress(zstandard.ZstdError),
         zstandard.ZstdDecompressor().stream_reader(BytesIO(packed), read_size=_CUT_READ_BYTES) as reader,
     ):
         while length < size and (data := reader.read(min(_CUT_READ_BYTES, size - length))):
-            found.append(data)
+            pieces.append(data)
             length += len(data)
-    return b"".join(found)
+    return b"".join(pieces)
 
 
 def _unpack_lz4(packed: bytes, size: int, cut: bool) -> bytes:
@@ -157,18 +157,18 @@ def _unpack_lz4(packed: bytes, size: int, cut: bool) -> bytes:
     except ImportError:
         must = "compressed by zstd or not at all; for lz4, install its library (pip install lz4)"
         raise InputError("file", must, Words("chunks compressed by lz4")) from None
-    decompressor, found, length = LZ4FrameDecompressor(), [], 0
+    decompressor, pieces, length = LZ4FrameDecompressor(), [], 0
     step = _CUT_READ_BYTES if cut else max(1, len(packed))
     try:
         for start in range(0, len(packed), step):
-            found.append(decompressor.decompress(packed[start : start + step], max_length=size - length + 1))
-            length += len(found[-1])
+            pieces.append(decompressor.decompress(packed[start : start + step], max_length=size - length + 1))
+            length += len(pieces[-1])
             if decompressor.eof or length > size:
                 break
     except RuntimeError as error:
         if not cut:
             raise DamagedError(str(error)) from None
-    return b"".join(found)
+    return b"".join(pieces)
 
 
 _UNPACKERS: dict[bytes, Callable[[bytes, int, bool], bytes]] = {

@@ -99,27 +99,27 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool, in_part: bool = F
     """
     footer = _read_footer(file, size)
     if footer is None or salvage:
-        found, _ = _walk_records(file, size)
+        contents, _ = _walk_records(file, size)
         if footer is not None:
-            found.finished = True
+            contents.finished = True
             with contextlib.suppress(DamagedError):  # a damaged chunk may have held channel records
-                summary = _read_summary(file, size, footer).found
-                found.topics, found.about = summary.topics | found.topics, summary.about | found.about
-        return _count_messages(file, found)
+                summary = _read_summary(file, size, footer).contents
+                contents.topics, contents.about = summary.topics | contents.topics, summary.about | contents.about
+        return _count_messages(file, contents)
     summary = _read_summary(file, size, footer)
     limits = _RecordLimits(size)
-    found, data_end = summary.found, summary.start - _DATA_END.size
+    contents, data_end = summary.contents, summary.start - _DATA_END.size
     if not summary.indexed or not _check_index(file, summary, data_end, limits):
-        found, data_end = _walk_records(file, size, finished=True)
-        if data_end is None or found.damaged:
+        contents, data_end = _walk_records(file, size, finished=True)
+        if data_end is None or contents.damaged:
             raise DamagedError("damaged records in the data section")
-        _check_against(summary, _count_messages(file, found))
-    _check_end(file, found, data_end, in_part=in_part)
-    found.complete = found.finished = True
-    return found
+        _check_against(summary, _count_messages(file, contents))
+    _check_end(file, contents, data_end, in_part=in_part)
+    contents.complete = contents.finished = True
+    return contents
 
 
-def _check_end(file: BinaryIO, found: Contents, data_end: int, *, in_part: bool) -> None:
+def _check_end(file: BinaryIO, contents: Contents, data_end: int, *, in_part: bool) -> None:
     """Verify the checksum of the data section; if there is none, name the unverified data."""
     file.seek(data_end)
     opcode, length, expected = _DATA_END.unpack(file.read(_DATA_END.size))
@@ -128,21 +128,21 @@ def _check_end(file: BinaryIO, found: Contents, data_end: int, *, in_part: bool)
     if expected:
         if not in_part and _checksum(file, data_end) != expected:
             raise DamagedError("a wrong checksum of the data section")
-        found.unchecked = ()
-    elif COPY not in found.attachments:
-        found.unchecked = ("its metadata (written by an earlier version, without a checksum of the whole file)",)
+        contents.unchecked = ()
+    elif COPY not in contents.attachments:
+        contents.unchecked = ("its metadata (written by an earlier version, without a checksum of the whole file)",)
     else:
-        found.unchecked += ("records without a checksum of their own (the file has no checksum of the whole)",)
+        contents.unchecked += ("records without a checksum of their own (the file has no checksum of the whole)",)
 
 
-def _check_against(summary: _Summary, found: Contents) -> None:
+def _check_against(summary: _Summary, contents: Contents) -> None:
     """Compare the contents of the data section with the summary."""
-    stated, chunks = summary.found, {chunk.offset for chunk in found.chunks}
-    if found.damaged or not set(found.counts) <= set(found.topics):
+    stated, chunks = summary.contents, {chunk.offset for chunk in contents.chunks}
+    if contents.damaged or not set(contents.counts) <= set(contents.topics):
         raise DamagedError("damaged chunks")
     if not {chunk.offset for chunk in stated.chunks if chunk.channels} <= chunks:
         raise DamagedError("an index that does not fit the file")
-    if summary.counted and {number: count for number, count in stated.counts.items() if count} != found.counts:
+    if summary.counted and {number: count for number, count in stated.counts.items() if count} != contents.counts:
         raise DamagedError("message counts that do not fit the file")
 
 
@@ -152,9 +152,9 @@ def _check_index(file: BinaryIO, summary: _Summary, data_end: int, limits: _Reco
     Returns:
         True if the index lists all messages; False if there are messages outside chunks.
     """
-    found, position, places = summary.found, len(MAGIC), set()
-    indexed = summary.places | {(chunk.offset, chunk.length + RECORD.size) for chunk in found.chunks}
-    found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # a chunk without an index has no messages
+    contents, position, places = summary.contents, len(MAGIC), set()
+    indexed = summary.places | {(chunk.offset, chunk.length + RECORD.size) for chunk in contents.chunks}
+    contents.chunks = [chunk for chunk in contents.chunks if chunk.channels]  # a chunk without an index has no messages
     while position < data_end:
         file.seek(position)
         opcode, length = _read_head(file)
@@ -167,14 +167,14 @@ def _check_index(file: BinaryIO, summary: _Summary, data_end: int, limits: _Reco
         if opcode == Opcode.CHUNK or opcode in summary.kinds:
             places.add((position, end - position))
         if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
-            _read_record(found, opcode, file.read(length))
+            _read_record(contents, opcode, file.read(length))
         position = end
     if places != indexed:
         raise DamagedError("an index that does not fit the file")
-    if sum(found.counts.values()) > limits.unpacked // (RECORD.size + MESSAGE.size):
+    if sum(contents.counts.values()) > limits.unpacked // (RECORD.size + MESSAGE.size):
         raise DamagedError("a message count larger than the file can hold")
-    counted = {number for number, count in found.counts.items() if count}
-    if counted != set().union(*(chunk.channels or () for chunk in found.chunks)):
+    counted = {number for number, count in contents.counts.items() if count}
+    if counted != set().union(*(chunk.channels or () for chunk in contents.chunks)):
         raise DamagedError("message counts that do not fit the index")
     return True
 
@@ -240,14 +240,14 @@ class _Summary:
 
     Attributes:
         start: Position of the summary [bytes].
-        found: Channels, counts and chunks.
+        contents: Channels, counts and chunks.
         counted: Whether it has statistics.
         places: Offset and length of each indexed metadata record and attachment.
         kinds: Opcodes of the indexed kinds of the two.
     """
 
     start: int
-    found: Contents = field(default_factory=Contents)
+    contents: Contents = field(default_factory=Contents)
     counted: bool = False
     places: set[tuple[int, int]] = field(default_factory=set)
     kinds: set[int] = field(default_factory=set)
@@ -255,9 +255,9 @@ class _Summary:
     @property
     def indexed(self) -> bool:
         """True if the summary suffices to find all messages: channels, counts, and a chunk index with channels."""
-        chunks, counts = self.found.chunks, {number for number, count in self.found.counts.items() if count}
+        chunks, counts = self.contents.chunks, {number for number, count in self.contents.counts.items() if count}
         listed = set().union(*(chunk.channels or () for chunk in chunks))
-        return self.counted and bool(listed) and counts | listed <= set(self.found.topics)
+        return self.counted and bool(listed) and counts | listed <= set(self.contents.topics)
 
 
 def _read_summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> _Summary:
@@ -275,25 +275,25 @@ def _read_summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> _Summar
     if expected and zlib.crc32(data) != expected:
         raise DamagedError("a wrong checksum of the summary")
     summary = _Summary(start)
-    found, limits = summary.found, _RecordLimits(len(data))
+    contents, limits = summary.contents, _RecordLimits(len(data))
     for opcode, at, stop in records(data[: end - start]):
         limits.count_record(opcode, file, 0)
         if opcode == Opcode.CHUNK_INDEX:
-            found.chunks.append(_parse_chunk_index(data[at:stop]))
+            contents.chunks.append(_parse_chunk_index(data[at:stop]))
             continue
         body = ReadDataStream(BytesIO(data[at:stop]))
         if opcode == Opcode.CHANNEL:
             channel = Channel.read(body)
-            _add_topic(found, channel)
+            _add_topic(contents, channel)
         elif opcode == Opcode.STATISTICS:
-            found.counts, summary.counted = dict(Statistics.read(body).channel_message_counts), True
+            contents.counts, summary.counted = dict(Statistics.read(body).channel_message_counts), True
         elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
             attached = opcode == Opcode.ATTACHMENT_INDEX
             index = (AttachmentIndex if attached else MetadataIndex).read(body)
             summary.places.add((index.offset, index.length))
             summary.kinds.add(Opcode.ATTACHMENT if attached else Opcode.METADATA)
-    found.chunks.sort(key=lambda chunk: chunk.offset)
-    for earlier, later in pairwise(found.chunks):
+    contents.chunks.sort(key=lambda chunk: chunk.offset)
+    for earlier, later in pairwise(contents.chunks):
         if later.offset < earlier.offset + earlier.length:
             raise DamagedError("overlapping chunks")
     return summary
@@ -308,13 +308,13 @@ def _parse_chunk_index(body: bytes) -> Chunk:
     return Chunk(offset, length - RECORD.size, begin_ns, end_ns, channels)
 
 
-def _add_topic(found: Contents, channel: Channel) -> None:
-    if found.topics.setdefault(channel.id, channel.topic) != channel.topic:
+def _add_topic(contents: Contents, channel: Channel) -> None:
+    if contents.topics.setdefault(channel.id, channel.topic) != channel.topic:
         raise DamagedError("two channels with the same number")
-    found.about[channel.topic] = channel.metadata
+    contents.about[channel.topic] = channel.metadata
 
 
-def _read_record(found: Contents, opcode: int, body: bytes) -> None:
+def _read_record(contents: Contents, opcode: int, body: bytes) -> None:
     """Read a metadata record or an attachment.
 
     Raises:
@@ -327,10 +327,10 @@ def _read_record(found: Contents, opcode: int, body: bytes) -> None:
             stated = int.from_bytes(body[stream.count - 4 : stream.count], "little")
             if stated and zlib.crc32(body[: stream.count - 4]) != stated:  # 0: no checksum
                 raise DamagedError("an attachment with a wrong checksum")
-            kept, name, value = found.attachments, attachment.name, attachment.data
+            kept, name, value = contents.attachments, attachment.name, attachment.data
         else:
             metadata = Metadata.read(stream)
-            kept, name, value = found.metadata, metadata.name, metadata.metadata
+            kept, name, value = contents.metadata, metadata.name, metadata.metadata
     except (McapError, struct.error, UnicodeDecodeError):
         raise DamagedError("a record of the wrong length") from None
     if stream.count > len(body) or name in kept:  # later format versions may append fields
@@ -343,7 +343,7 @@ def _walk_records(file: BinaryIO, size: int, *, finished: bool = False) -> tuple
 
     Only records that lie completely in the file count, so a truncation costs at most one chunk.
     """
-    found, bare_from = Contents(), 0
+    contents, bare_from = Contents(), 0
     position, limits, last = len(MAGIC), _RecordLimits(size), _LAST_OPCODE if finished else _LAST_SUSPECT_OPCODE
     while position + RECORD.size <= size:
         file.seek(position)
@@ -351,34 +351,34 @@ def _walk_records(file: BinaryIO, size: int, *, finished: bool = False) -> tuple
         end = position + RECORD.size + length
         bare = opcode in _CHUNKABLE_OPCODES and end <= size
         if bare_from and not (bare and end - bare_from <= READ_BYTES):
-            found.chunks.append(Chunk(bare_from, position - bare_from, bare=True))
+            contents.chunks.append(Chunk(bare_from, position - bare_from, bare=True))
             bare_from = 0
         if opcode == 0 or end > size:
             # Truncated, or zeros from unwritten pages after a power failure; otherwise the length is damaged.
             if opcode == Opcode.CHUNK and _lengths_agree(file, length):
-                found.chunks.append(Chunk(position, size - position - RECORD.size, cut=True))
+                contents.chunks.append(Chunk(position, size - position - RECORD.size, cut=True))
             elif not (length == 0 and _only_zeros(file) if opcode == 0 else _is_plausible(file, opcode, length)):
-                found.damaged += 1
+                contents.damaged += 1
             break
         if opcode == Opcode.DATA_END and length >= 4:
-            return found, position
+            return contents, position
         limits.count_record(opcode, file, length)
         if bare:
             bare_from = bare_from or position
         elif opcode == Opcode.CHUNK:
-            found.chunks.append(Chunk(position, length))
+            contents.chunks.append(Chunk(position, length))
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             try:
-                _read_record(found, opcode, file.read(length))
+                _read_record(contents, opcode, file.read(length))
             except DamagedError:
-                found.damaged += 1
+                contents.damaged += 1
         elif opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX) and opcode <= last:
-            found.damaged += 1
+            contents.damaged += 1
         position = end
     else:
         if bare_from:
-            found.chunks.append(Chunk(bare_from, position - bare_from, bare=True))
-    return found, None
+            contents.chunks.append(Chunk(bare_from, position - bare_from, bare=True))
+    return contents, None
 
 
 def _lengths_agree(file: BinaryIO, length: int) -> bool:
@@ -406,10 +406,10 @@ def _only_zeros(file: BinaryIO) -> bool:
     return True
 
 
-def _count_messages(file: BinaryIO, found: Contents) -> Contents:
+def _count_messages(file: BinaryIO, contents: Contents) -> Contents:
     """Determine channels, counts and times of an unfinished file from its chunks; unreadable chunks are skipped."""
     good, counts, unchecked, bare = [], [], 0, 0
-    for chunk in found.chunks:
+    for chunk in contents.chunks:
         times_ns: list[int] = []
         inside: dict[int, int] = {}
         try:
@@ -420,9 +420,9 @@ def _count_messages(file: BinaryIO, found: Contents) -> Contents:
                     inside[number] = inside.get(number, 0) + 1
                     times_ns.append(time_ns)
                 elif opcode == Opcode.CHANNEL:
-                    _add_topic(found, Channel.read(ReadDataStream(BytesIO(data[start:end]))))
+                    _add_topic(contents, Channel.read(ReadDataStream(BytesIO(data[start:end]))))
         except (McapError, struct.error, ValueError):
-            found.damaged += 1
+            contents.damaged += 1
             continue
         if times_ns:
             good.append(replace(chunk, begin_ns=min(times_ns), end_ns=max(times_ns), channels=frozenset(inside)))
@@ -430,15 +430,15 @@ def _count_messages(file: BinaryIO, found: Contents) -> Contents:
             unchecked += len(times_ns) if chunk.cut else 0
             bare += len(times_ns) if chunk.bare else 0
     for inside in counts:
-        if not set(inside) <= set(found.topics):
-            found.damaged += 1
-        for number in set(inside) & set(found.topics):
-            found.counts[number] = found.counts.get(number, 0) + inside[number]
-    found.chunks = good
-    if COPY not in found.attachments:
-        found.unchecked += ("its metadata (written by an earlier version)",)
+        if not set(inside) <= set(contents.topics):
+            contents.damaged += 1
+        for number in set(inside) & set(contents.topics):
+            contents.counts[number] = contents.counts.get(number, 0) + inside[number]
+    contents.chunks = good
+    if COPY not in contents.attachments:
+        contents.unchecked += ("its metadata (written by an earlier version)",)
     if unchecked:
-        found.unchecked += (f"the last {unchecked} messages (of the chunk in which the file ends)",)
+        contents.unchecked += (f"the last {unchecked} messages (of the chunk in which the file ends)",)
     if bare:
-        found.unchecked += (f"{bare} messages outside chunks",)
-    return found
+        contents.unchecked += (f"{bare} messages outside chunks",)
+    return contents

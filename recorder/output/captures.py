@@ -152,16 +152,16 @@ class Captures(Sink):
 
     def _fired_by(self, payload: Payload, start_ns: int) -> list[tuple[Trigger, int, bool]]:
         """Return the triggers of a payload, their simulated times [ns], and whether each may start a capture."""
-        found = []
+        fired = []
         for trigger in self._capture.triggers:
             crossings = self._crossings.get(trigger)
             if crossings is None:
-                found += [(trigger, start_ns, True)] if payload.event(trigger.name) else []
+                fired += [(trigger, start_ns, True)] if payload.event(trigger.name) else []
             elif payload.block is not None and payload.key == crossings.key:
-                found += [(trigger, *each) for each in crossings.take(payload.block, start_ns)]
+                fired += [(trigger, *each) for each in crossings.take(payload.block, start_ns)]
                 if crossings.remark and crossings.remark not in self.remarks:
                     self.remarks += (crossings.remark,)
-        return found
+        return fired
 
     def _fire(self, trigger: Trigger, time_ns: int, *, is_new: bool) -> None:
         writing = self._open if self._open is not None and time_ns <= self._open.end_ns else None

@@ -78,11 +78,10 @@ def _views_titled(text: str, columns: list[_Column]) -> list[rrb.View | rrb.Cont
     """Return the views whose title contains a text."""
     rows = [row for views, _ in columns for row, _ in views]
     views = [view for row in rows for view in (row.contents if isinstance(row, rrb.Container) else [row])]
-    titles = [str(view.name) for view in views]
-    found = [view for view, title in zip(views, titles, strict=True) if text.strip() and text.lower() in title.lower()]
-    if not found:
-        raise InputError("--only", f"part of a title: {'; '.join(titles)}", text)
-    return found
+    shown = [view for view in views if text.strip() and text.lower() in str(view.name).lower()]
+    if not shown:
+        raise InputError("--only", f"part of a title: {'; '.join(str(view.name) for view in views)}", text)
+    return shown
 
 
 def _spectrum_view() -> rrb.BarChartView:
@@ -148,14 +147,14 @@ def _curve_views(table: ChannelTable, geometry: Geometry, *, live: bool) -> dict
         "Hammer [N]": [f"{series.ROOT}/hammer/hammer"],
     }
     limits = {f"{series.ROOT}/probes/{plane}": 1.15 * geometry.clearance_mm(plane) for plane in orbit.PLANES}
-    known = series.get_paths(table)
+    drawn = series.get_paths(table)
     planned = {path for paths in plots.values() for path in paths}
     views = {
-        title: _curve_view(title, [path for path in paths if path in known], limit=limits.get(paths[0]), live=live)
+        title: _curve_view(title, [path for path in paths if path in drawn], limit=limits.get(paths[0]), live=live)
         for title, paths in plots.items()
-        if set(paths) & set(known)
+        if set(paths) & set(drawn)
     }
-    others = {path.removeprefix(f"{series.ROOT}/"): path for path in known if path not in planned}
+    others = {path.removeprefix(f"{series.ROOT}/"): path for path in drawn if path not in planned}
     return views | {
         title: _curve_view(title, [path], limit=None, live=live, legend=True) for title, path in others.items()
     }

@@ -29,10 +29,10 @@ _HIDDEN_LIMIT_S = 15.0
 """Time after which a hidden page is unloaded [s], as it processes no data; it reloads when visible."""
 _SCRIPT = """<script>
 const page = Math.random().toString(36).slice(2);
-let seen = Date.now();
-async function tell() {
-  if (!document.hidden) seen = Date.now();
-  if (Date.now() - seen > %s) return location.replace("resting");
+let visibleMs = Date.now();
+async function report() {
+  if (!document.hidden) visibleMs = Date.now();
+  if (Date.now() - visibleMs > %s) return location.replace("resting");
   try {
     if (document.hidden) navigator.sendBeacon("closed?" + page);
     else {
@@ -41,10 +41,10 @@ async function tell() {
       document.title = await reply.text();
     }
   } catch (error) { console.debug(error); }
-  setTimeout(tell, 200);
+  setTimeout(report, 200);
 }
 addEventListener("pagehide", () => navigator.sendBeacon("closed?" + page));
-tell();
+report();
 </script></body>"""
 _RESTING_PAGE = b"""<!doctype html><title>rig: resting</title><script>
 document.addEventListener("visibilitychange", () => document.hidden || location.replace("/"));

@@ -313,7 +313,7 @@ def load_extensions(
         kind: Class of an entry.
         used_names: Names in the table.
     """
-    found: dict[str, Extension] = {}
+    entries: dict[str, Extension] = {}
     broken = []
     for point in find_entry_points(group):
         try:
@@ -321,31 +321,31 @@ def load_extensions(
         except (Exception, SystemExit) as error:  # external code may raise anything
             broken.append(f"{point.name} ({point.value} cannot be loaded: {describe_error(error)})")
             continue
-        if point.name in {*used_names, *found}:
+        if point.name in {*used_names, *entries}:
             broken.append(f"{point.name} ({point.value} has a name that is in use)")
         elif not isinstance(entry, kind):
             broken.append(f"{point.name} ({point.value} must be a {kind.__module__}.{kind.__qualname__})")
         else:
             try:
-                found[point.name] = TypeAdapter(kind).validate_python(entry, strict=True)
+                entries[point.name] = TypeAdapter(kind).validate_python(entry, strict=True)
             except ValidationError as error:
                 mismatch = input_error(error, "", BaseModel)
                 broken.append(f"{point.name} ({point.value}: {mismatch})")
-    return found, broken
+    return entries, broken
 
 
 def _name_location(parts: tuple[str | int, ...], kind: str) -> list[str]:
     """Return the names of an error's location that occur in the file."""
     named = kind in ("extra_forbidden", "missing")
-    found = []
+    names = []
     for number, part in enumerate(parts):
         name, last = str(part), number == len(parts) - 1
         branch = _BRANCH.fullmatch(name) or (last and kind.startswith(_PLAIN_BRANCH.get(name, ("\0",))))
         # A timed command's own fields are next to its time.
         inner = name == "request" and number > 0 and isinstance(parts[number - 1], int)
         if (last and named) or not (branch or inner):
-            found.append(printable(name, 100) or '""')
-    return found
+            names.append(printable(name, 100) or '""')
+    return names
 
 
 def _fields(models: list[type[BaseModel]], parts: tuple[str | int, ...]) -> list[str]:
@@ -391,8 +391,8 @@ def input_error(error: ValidationError, field_prefix: str, model: type[BaseModel
         name = str(context.get("discriminator")).strip("'")
         return InputError(f"{field}.{name}", f"one of {context.get('expected_tags')}", context.get("tag"))
     if first["type"] == "extra_forbidden":
-        known = _fields([model], first["loc"][:-1])
-        message = such_as("a known field", first["loc"][-1], known) if known else "left out (it has no fields)"
+        names = _fields([model], first["loc"][:-1])
+        message = such_as("a known field", first["loc"][-1], names) if names else "left out (it has no fields)"
     elif first["type"] == "missing":
         message = "given"
     return InputError(field, message, None if first["type"] == "missing" else first["input"])

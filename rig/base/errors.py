@@ -55,18 +55,18 @@ class UnknownNameError(InputError, KeyError):
         name must be one of the existing names, such as disk_y, disk_x (15 in all); received 'disk_z'
     """
 
-    def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:
+    def __init__(self, field: str, must: str, name: object, known_names: Iterable[str]) -> None:
         """Set the field, the requirement, the unknown name, and the known names."""
-        super().__init__(field, such_as(must, name, known), name)
+        super().__init__(field, such_as(must, name, known_names), name)
 
     __str__ = ValueError.__str__  # KeyError would add quotes
 
 
-def such_as(must: str, name: object, known: Iterable[str]) -> str:
+def such_as(must: str, name: object, known_names: Iterable[str]) -> str:
     """Return a requirement with known names similar to an unknown one, otherwise with all."""
-    known = list(dict.fromkeys(known))
-    shown = find_similar(name, known) or known[:_MAX_NAMES]
-    more = f" ({len(known)} in all)" if len(known) > len(shown) else ""
+    known_names = list(dict.fromkeys(known_names))
+    shown = find_similar(name, known_names) or known_names[:_MAX_NAMES]
+    more = f" ({len(known_names)} in all)" if len(known_names) > len(shown) else ""
     return f"{must}, such as {', '.join(shown)}{more}" if shown else must
 
 

@@ -31,8 +31,8 @@ class Outcome(StrEnum):
     @classmethod
     def worst(cls, outcomes: Iterable[Outcome]) -> Outcome:
         """Return the worst outcome: FAIL, then INCONCLUSIVE, then PASS; INCONCLUSIVE without outcomes."""
-        found = set(outcomes)
-        return cls.judge(failed=cls.FAIL in found, has_evidence=found == {cls.PASS})
+        kinds = set(outcomes)
+        return cls.judge(failed=cls.FAIL in kinds, has_evidence=kinds == {cls.PASS})
 
 
 class InconclusiveError(Exception):

@@ -34,12 +34,12 @@ def printable(text: str, most: int | None = None) -> str:
     return text
 
 
-def find_similar(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
+def find_similar(name: object, known_names: Iterable[str], *, most: int = 3) -> list[str]:
     """Return known names similar to an unknown one, most similar first; case is ignored.
 
     Args:
         name: The unknown name.
-        known: The known names.
+        known_names: The known names.
         most: Largest number of names.
 
     Example:
@@ -48,7 +48,7 @@ def find_similar(name: object, known: Iterable[str], *, most: int = 3) -> list[s
     """
     import difflib
 
-    folded = {each.casefold(): each for each in known}
+    folded = {each.casefold(): each for each in known_names}
     return [folded[each] for each in difflib.get_close_matches(str(name)[:100].casefold(), folded, most, 0.5)]
 
 

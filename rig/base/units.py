@@ -88,8 +88,8 @@ QUANTITIES = tuple(_TABLE)
 
 def canonical(unit: str) -> str:
     """Return a unit in this project's spelling; an unknown or ambiguous one unchanged."""
-    found = _find(unit)
-    return found[0] if len(found) == 1 else unit.strip()
+    candidates = _find(unit)
+    return candidates[0] if len(candidates) == 1 else unit.strip()
 
 
 def is_known(unit: str) -> bool:
@@ -99,9 +99,9 @@ def is_known(unit: str) -> bool:
 
 def _unknown(unit: str, also: Iterable[str] = ()) -> str:
     """Return the requirement for a unit that is not known, with a suggestion."""
-    found = _find(unit)
-    if len(found) > 1:
-        return f"unambiguous: {' or '.join(found)}"
+    candidates = _find(unit)
+    if len(candidates) > 1:
+        return f"unambiguous: {' or '.join(candidates)}"
     if (split := _DETECTOR.fullmatch(unit.strip())) and is_known(split[1]):
         name = canonical(split[1])
         return f"a unit of samples, such as {name} ({split[2]} is the reading of a detector; give {name} if it is not)"
@@ -127,14 +127,14 @@ def parse(unit: str, *, field: str, also: Iterable[str] = ()) -> str:
 
 def get_quantity(unit: str) -> str:
     """Return the quantity that a unit measures: length, force, voltage, ...; empty if it is unknown."""
-    found = _UNITS.get(canonical(unit))
-    return found.quantity if found else ""
+    entry = _UNITS.get(canonical(unit))
+    return entry.quantity if entry else ""
 
 
 def size_si(unit: str) -> float:
     """Return the size of a unit in SI; 1 for an unknown unit."""
-    found = _UNITS.get(canonical(unit))
-    return found.size if found else 1.0
+    entry = _UNITS.get(canonical(unit))
+    return entry.size if entry else 1.0
 
 
 def get_si_unit(unit: str) -> tuple[str, float, float]:
@@ -142,8 +142,8 @@ def get_si_unit(unit: str) -> tuple[str, float, float]:
 
     An unknown unit is returned unchanged, with 1 and 0.
     """
-    found = _UNITS.get(canonical(unit))
-    return (_SI[found.quantity], found.size, found.zero) if found else (unit, 1.0, 0.0)
+    entry = _UNITS.get(canonical(unit))
+    return (_SI[entry.quantity], entry.size, entry.zero) if entry else (unit, 1.0, 0.0)
 
 
 def factor(unit: str, target: str, *, field: str) -> float:

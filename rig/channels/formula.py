@@ -118,13 +118,13 @@ class Formulas(Grammar):
 
     def values(self, rows: np.ndarray) -> np.ndarray:
         """Return all formulas at observed rows, shape (n, formulas); values that are not finite become 0."""
-        found = np.empty((len(rows), len(self._formulas)))
+        values = np.empty((len(rows), len(self._formulas)))
         if self._formulas:
             with np.errstate(all="ignore"):
                 for n, part in enumerate(self._formulas):
-                    found[:, n] = part(rows) if callable(part) else part
-            found[~np.isfinite(found)] = 0.0
-        return found
+                    values[:, n] = part(rows) if callable(part) else part
+            values[~np.isfinite(values)] = 0.0
+        return values
 
     def name(self, name: str, field: str) -> Part:
         """Return a signal of the model."""

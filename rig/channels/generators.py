@@ -321,16 +321,16 @@ def _source(generator: Generator, channel: Channel, position: float, speed_hz: f
     gain, phase_lead = channel.sensitivity_v, (merged.phase_deg or 0.0) / 360.0 + (position if generator.apart else 0.0)
     offset_v = merged.offset_v if merged.offset_v is not None else (merged.offset or 0.0) * gain
     peak_v = merged.amplitude_v if merged.amplitude_v is not None else (merged.amplitude or 0.0) * gain
-    found = VoltageSource(channel, merged, peak_v, channel.bias_v + offset_v, phase_lead)
+    source = VoltageSource(channel, merged, peak_v, channel.bias_v + offset_v, phase_lead)
     if merged.kind == "ramp" and not {*_AMPLITUDES} & {*signal}:
-        found = replace(found, amplitude_v=channel.adc_v, middle_v=offset_v)
+        source = replace(source, amplitude_v=channel.adc_v, middle_v=offset_v)
     if merged.kind == "recorded":
         file = generator.file
         if file is None or file.units.get(channel.name) != channel.unit:
             must = f"with a column `{channel.name} [{channel.unit}]` (or another kind for this channel)"
             raise InputError("generator.file", must, sorted(file.values) if file else None)
-        found = replace(found, amplitude_v=gain, waveform=(file.period, file.spline(channel.name)))
-    return found
+        source = replace(source, amplitude_v=gain, waveform=(file.period, file.spline(channel.name)))
+    return source
 
 
 def _merge_fields(signal: Signal, base: dict[str, Any], kind: str | None, field: str) -> dict[str, Any]:
@@ -352,18 +352,18 @@ def _merge_fields(signal: Signal, base: dict[str, Any], kind: str | None, field:
         if {*pair} <= {*own}:
             raise InputError(f"{field}.{pair[0]}", f"left out where {pair[1]} is given", own[pair[0]])
     restated = {name for pair in (_OFFSETS, _AMPLITUDES) if {*pair} & {*own} for name in pair}
-    found = {name: value for name, value in base.items() if name in accepted - restated} | own | {"kind": kind}
-    for name in (*rule.required, *(("amplitude_v",) if rule.amplitude and not {*_AMPLITUDES} & {*found} else ())):
-        if name not in found:
+    merged = {name: value for name, value in base.items() if name in accepted - restated} | own | {"kind": kind}
+    for name in (*rule.required, *(("amplitude_v",) if rule.amplitude and not {*_AMPLITUDES} & {*merged} else ())):
+        if name not in merged:
             raise InputError(f"{field}.{name}", f"given with kind {kind}", None)
-    if kind in ("two-tone", "chirp") and len(found["frequencies"]) != 2:
-        raise InputError(f"{field}.frequencies", f"two with kind {kind}", list(found["frequencies"]))
+    if kind in ("two-tone", "chirp") and len(merged["frequencies"]) != 2:
+        raise InputError(f"{field}.frequencies", f"two with kind {kind}", list(merged["frequencies"]))
     if kind == "multisine":
         try:
-            multisine_phases(found["frequencies"], found.get("crest"))
+            multisine_phases(merged["frequencies"], merged.get("crest"))
         except InputError as error:
             raise InputError(f"{field}.{error.field}", error.must, error.received) from None
-    return found
+    return merged
 
 
 def _check_rate(signal: Signal, channel: Channel, field: str) -> None:
@@ -404,15 +404,15 @@ def chips(order: int, seed: int) -> np.ndarray:
     """
     length, taps = 2**order - 1, _TAPS[order]
     positions = [order, *(taps if isinstance(taps, tuple) else (taps,))]
-    register, found = seed & length or 1, np.empty(length)
+    register, sequence = seed & length or 1, np.empty(length)
     for n in range(length):
-        found[n] = 2 * (register >> (order - 1)) - 1
+        sequence[n] = 2 * (register >> (order - 1)) - 1
         bit = 0
         for tap in positions:
             bit ^= register >> (tap - 1)
         register = (register << 1 | bit & 1) & length
-    found.flags.writeable = False
-    return found
+    sequence.flags.writeable = False
+    return sequence
 
 
 @cache

@@ -197,14 +197,14 @@ def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tu
     return np.array(speeds), np.array(vectors, dtype=complex)
 
 
-def _check_rows(*, at_least: int = 1, **given: ArrayLike) -> list[np.ndarray]:
+def _check_rows(*, at_least: int = 1, **arrays: ArrayLike) -> list[np.ndarray]:
     """Return finite rows of equal length as float64, each shape (n,); instants must ascend.
 
     Raises:
         InputError: The rows are invalid.
     """
     rows: list[np.ndarray] = []
-    for name, values in given.items():
+    for name, values in arrays.items():
         try:
             row = np.asarray(values)
         except ValueError:  # lists of different lengths
@@ -216,20 +216,20 @@ def _check_rows(*, at_least: int = 1, **given: ArrayLike) -> list[np.ndarray]:
         if not np.isfinite(row).all():
             raise InputError(name, "finite numbers", Words(f"{np.sum(~np.isfinite(row))} that are not"))
         if rows and len(row) != len(rows[0]):
-            raise InputError(name, f"as long as {next(iter(given))}, {len(rows[0])}", Words(f"{len(row)}"))
+            raise InputError(name, f"as long as {next(iter(arrays))}, {len(rows[0])}", Words(f"{len(row)}"))
         if name in _INSTANTS and (np.diff(row) <= 0.0).any():
             raise InputError(name, "ascending", Words("instants that are not"))
         rows.append(row.astype(float))
     return rows
 
 
-def _check_positive(**given: float) -> None:
+def _check_positive(**numbers: float) -> None:
     """Raise an error unless each value is a number greater than 0.
 
     Raises:
         InputError: A value is not.
     """
-    for name, value in given.items():
+    for name, value in numbers.items():
         if not isinstance(value, int | float | np.integer | np.floating) or not 0.0 < value < math.inf:
             raise InputError(name, "a number greater than 0", value)
 

@@ -114,10 +114,10 @@ def first_row(tick: int, rate_hz: int) -> int:
 def lagrange(places: np.ndarray, nodes: Sequence[int] | np.ndarray) -> np.ndarray:
     """Return the weights of the polynomial through nodes, evaluated at places, shape (nodes, places)."""
     distances = [places - node for node in nodes]
-    found = np.ones((len(distances), *np.shape(places)))
-    for weight, node in zip(found, nodes, strict=True):
+    weights = np.ones((len(distances), *np.shape(places)))
+    for weight, node in zip(weights, nodes, strict=True):
         for other, distance in zip(nodes, distances, strict=True):
             if other != node:
                 weight *= distance
         weight /= math.prod(node - other for other in nodes if other != node)
-    return found
+    return weights

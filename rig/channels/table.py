@@ -209,19 +209,19 @@ def build_table(groups: dict[str, Any], curves: dict[str, Any] | None = None) ->
     return check(ChannelTable, table, field="channel table")
 
 
-def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:
+def check_signals(channels: Iterable[Channel], names: Collection[str]) -> None:
     """Refuse channels of a signal that the model does not have.
 
     Args:
         channels: The channels.
-        known: Names of the model's signals.
+        names: Names of the model's signals.
 
     Raises:
         InputError: The message names the first such channel.
     """
     for channel in channels:
-        if channel.signal not in known:
-            raise UnknownNameError(f"channel {channel.name}.signal", "one of the model's", channel.signal, known)
+        if channel.signal not in names:
+            raise UnknownNameError(f"channel {channel.name}.signal", "one of the model's", channel.signal, names)
 
 
 @cache

@@ -82,14 +82,14 @@ class _Command(_Page, TyperCommand):
         rest = super().parse_args(ctx, args)
         options = [name for param in self.params for name in param.opts if name.startswith("-")]
         values = {param.name: ctx.params[param.name] for param in self.params}
-        given = {name: value if isinstance(value, list | tuple) else [value] for name, value in values.items()}
+        lists = {name: value if isinstance(value, list | tuple) else [value] for name, value in values.items()}
         # An unknown option is parsed as an argument.
-        arguments = [each for param in self.params if param.param_type_name == "argument" for each in given[param.name]]
+        arguments = [each for param in self.params if param.param_type_name == "argument" for each in lists[param.name]]
         for each in map(str, [*arguments, *rest]):
             if each.startswith("--") and not escaped:
                 raise UnknownNameError("option", f"one of `{ctx.command_path} -h`", each, options)
         for param in self.params:
-            for each in given[param.name]:
+            for each in lists[param.name]:
                 # Comparisons with NaN never fail, so a NaN would wait or count without end.
                 if isinstance(each, float) and each != each:
                     raise InputError(shown_name(param), "a number", Words("nan"))
@@ -111,10 +111,10 @@ class _Command(_Page, TyperCommand):
         except InputError as error:
             named = self._by_field("option")
             fields = [field.replace("-", "_").removesuffix(".name") for field in error.field.split(" and ")]
-            found = [named[field] for field in fields if field in named]
-            if len(found) < len(fields) or all(ctx.params[param.name] in (None, []) for param in found):
+            params = [named[field] for field in fields if field in named]
+            if len(params) < len(fields) or all(ctx.params[param.name] in (None, []) for param in params):
                 raise
-            options = " and ".join(map(shown_name, found))
+            options = " and ".join(map(shown_name, params))
             must = re.sub(
                 r"\b[a-z]+_\w+", lambda name: shown_name(named[name[0]]) if name[0] in named else name[0], error.must
             )
@@ -225,22 +225,22 @@ def usage_error(error: Any) -> str:
     page, kind = f"`{error.ctx.command_path if error.ctx is not None else 'rig'} -h`", type(error).__name__
     wrong = error.__cause__.errors()[0] if hasattr(error.__cause__, "errors") else None
     if kind == "NoSuchOption":
-        known = [] if error.ctx is None else [name for param in error.ctx.command.params for name in param.opts]
-        options = (name for name in known if name.startswith("-"))
-        found: InputError = UnknownNameError("option", f"one of {page}", error.option_name, options)
+        all_options = [] if error.ctx is None else [name for param in error.ctx.command.params for name in param.opts]
+        options = (name for name in all_options if name.startswith("-"))
+        message: InputError = UnknownNameError("option", f"one of {page}", error.option_name, options)
     elif kind == "MissingParameter":
         says = (error.param.help or page).rstrip(".")
-        found = InputError(shown_name(error.param), f"given: {says[0].lower()}{says[1:]}", None)
+        message = InputError(shown_name(error.param), f"given: {says[0].lower()}{says[1:]}", None)
     elif kind == "BadOptionUsage":
         with_value = "requires" in error.message
         must = "followed by a value" if with_value else "given without a value"
-        found = InputError(error.option_name, must, None if with_value else Words("one"))
+        message = InputError(error.option_name, must, None if with_value else Words("one"))
     elif wrong is not None:
         received = Words(wrong["input"]) if _NUMBER.fullmatch(str(wrong["input"])) else wrong["input"]
         must = wrong["msg"].removeprefix("Input should be ").partition(", unable")[0]
         if "is not one of" in must:
             must = "one of " + must.partition(" is not one of ")[2].rstrip(".").replace("'", "")
-        found = InputError(shown_name(error.param), must, received)
+        message = InputError(shown_name(error.param), must, received)
     else:
         return f"{error.format_message()} (see {page})"
-    return str(found)
+    return str(message)

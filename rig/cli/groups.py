@@ -42,16 +42,16 @@ def expand_groups(command: Callable[..., None]) -> Callable[..., None]:
 
 def _fields(group: Any) -> list[inspect.Parameter]:
     hints = get_type_hints(group, include_extras=True)
-    found: list[inspect.Parameter] = []
+    parameters: list[inspect.Parameter] = []
     for field in fields(group):
         hint = hints[field.name]
         if is_dataclass(hint):
-            found += _fields(hint)
+            parameters += _fields(hint)
         else:
             default = inspect.Parameter.empty if field.default is MISSING else field.default
             keyword = inspect.Parameter.KEYWORD_ONLY
-            found.append(inspect.Parameter(field.name, keyword, default=default, annotation=hint))
-    return found
+            parameters.append(inspect.Parameter(field.name, keyword, default=default, annotation=hint))
+    return parameters
 
 
 def _build(group: Any, options: dict[str, Any]) -> Any:

@@ -93,15 +93,15 @@ def parse_pairs(option: str, texts: list[str] | None, form: str) -> dict[str, st
     Raises:
         InputError: A text has another form, or a left side occurs twice.
     """
-    found: dict[str, str] = {}
+    pairs: dict[str, str] = {}
     for text in texts or []:
         left, equals, right = (side.strip() for side in text.partition("="))
         if not (left and equals and right):
             raise InputError(option, form, text)
-        if left in found:
+        if left in pairs:
             raise InputError(option, f"given once for {left}", text)
-        found[left] = right
-    return found
+        pairs[left] = right
+    return pairs
 
 
 def override_parameters(

@@ -193,8 +193,8 @@ class Accuracy:
             turned = np.unwrap(between)
             frequency = abs(turned[-1] - turned[0]) / (2.0 * math.pi * span_s)
         angle = np.abs(between[whirls]).max(initial=0.0)
-        found = np.array([errors[0], errors[1], frequency, errors[2], angle, apart[:, 2 + S.THETA].max()])
-        self.errors = np.maximum(self.errors, found)
+        window_errors = np.array([errors[0], errors[1], frequency, errors[2], angle, apart[:, 2 + S.THETA].max()])
+        self.errors = np.maximum(self.errors, window_errors)
         errors_by_name, tolerances = dict(zip(QUANTITIES, self.errors, strict=True)), self._tolerances()
         exceeded = [
             name

@@ -218,8 +218,8 @@ def _load(name: Any, field: str, loading: tuple[str, ...]) -> ParameterSet:
         return _own_set(name)
     path = Path(name) if isinstance(name, str) else None
     if path is None or path.suffix != ".toml" or not path.is_file():
-        known = f"one of {', '.join(set_names())}, or the path of an existing .toml file"
-        raise InputError(field, f"the set that the file changes, {known}" if name is None else known, name)
+        sets = f"one of {', '.join(set_names())}, or the path of an existing .toml file"
+        raise InputError(field, f"the set that the file changes, {sets}" if name is None else sets, name)
     place = str(path.resolve())
     if place in loading:
         raise InputError(field, "a set other than the file itself and those based on it", name)
@@ -248,15 +248,15 @@ def _parse(name: str, data: dict[str, Any], path: Path, loading: tuple[str, ...]
             if not foundation and key not in entries:
                 must = such_as(f"a parameter of the set {base}", key, entries)
                 raise InputError(f"{path.name}: {key}", must, changed.get("value"))
-            known = entries[key].model_dump() if key in entries else {}
+            entry = entries[key].model_dump() if key in entries else {}
             for fixed in _MODEL_FIELDS:
-                if fixed in changed and known:
+                if fixed in changed and entry:
                     raise InputError(
                         f"{path.name}: {key}.{fixed}", "unchanged, as the model defines it", changed[fixed]
                     )
-            if "unit" in changed and known and changed["unit"] != known["unit"]:
-                raise InputError(f"{path.name}: {key}.unit", known["unit"], changed["unit"])
-            entries[key] = check(Parameter, {**known, **changed}, field=f"{path.name}: {key}")
+            if "unit" in changed and entry and changed["unit"] != entry["unit"]:
+                raise InputError(f"{path.name}: {key}.unit", entry["unit"], changed["unit"])
+            entries[key] = check(Parameter, {**entry, **changed}, field=f"{path.name}: {key}")
     return ParameterSet(name, title, entries)
 
 

@@ -94,13 +94,13 @@ class Calibrator:
             ADC counts by group, int32, shape (samples, channels).
         """
         start, self._tick = self._tick, self._tick + (len(rows) - 1) * self._row_ticks
-        found, shapes = {}, dict[tuple[int, Any], np.ndarray]()
+        counts_by_group, shapes = {}, dict[tuple[int, Any], np.ndarray]()
         for group in self.groups:
             rate = group.rate_hz
             first, end = (-(-tick * rate // TICKS_HZ) for tick in (start, self._tick))
             n = np.arange(first, end)
             instants = Instants.from_samples(n, rate)
-            counts = found[group.name] = np.empty((end - first, len(group.channels)), np.int32)
+            counts = counts_by_group[group.name] = np.empty((end - first, len(group.channels)), np.int32)
             for c, channel in enumerate(group.channels):
                 source, key = self._sources[channel.name], (rate, self._waves[channel.name])
                 if key not in shapes:
@@ -115,7 +115,7 @@ class Calibrator:
                 if faults is not None:
                     whole = faults.counts(channel.name, n, whole)
                 counts[:, c] = np.clip(whole, -half, half - 1.0)
-        return found
+        return counts_by_group
 
 
 class GeneratedFaults:

@@ -117,13 +117,13 @@ class FaultInjector:
     @cached_property
     def columns(self) -> dict[str, int]:
         """Column of each channel's signal in the rows, or after them."""
-        found = {}
+        columns = {}
         for conditioner in self.conditioners:
             if isinstance(conditioner, Calibrator):
                 continue
             names = (channel.name for group in conditioner.groups for channel in group.channels)
-            found |= zip(names, conditioner.columns.tolist(), strict=True)
-        return found
+            columns |= zip(names, conditioner.columns.tolist(), strict=True)
+        return columns
 
     def find_targets(self, command: FaultCommand, tick: int) -> tuple[str, ...]:
         """Return the channels that a fault changes, or whose blocks it affects.
@@ -208,8 +208,8 @@ class FaultInjector:
             self._check_effect(command, names, tick, fault_count + 1)
             return self._describe_effect(fault_count + 1, names, tick)
         if command.id != "all" and command.id not in active_ids:
-            known = ", ".join(map(str, active_ids)) or "none"
-            raise InputError("clear.id", f"the number of an active fault ({known}), or all", command.id)
+            ids = ", ".join(map(str, active_ids)) or "none"
+            raise InputError("clear.id", f"the number of an active fault ({ids}), or all", command.id)
         return {}
 
     def clear(self, command: ClearCommand, tick: int) -> list[dict[str, Any]]:
@@ -306,17 +306,17 @@ class FaultInjector:
         active = [fault for fault in self.active if fault.begin <= tick < fault.end]
         if (ids := [fault.id for fault in active]) != self._planned[0]:
             self._planned = ids, [Plan(conditioner.groups, active) for conditioner in self.conditioners]
-        found: dict[str, np.ndarray] = {}
+        counts_by_name: dict[str, np.ndarray] = {}
         volts = Volts(self.scales, rows, formula_values, tick, self.row_ticks, active)
         for position, (conditioner, plan) in enumerate(zip(self.conditioners, self._planned[1], strict=True)):
             if isinstance(conditioner, Calibrator):
-                found |= conditioner.counts(
+                counts_by_name |= conditioner.counts(
                     rows, formula_values, GeneratedFaults(conditioner, plan.faulty) if plan.faulty else None
                 )
                 continue
             if not plan.faulty:
                 self._twins = {key: twin for key, twin in self._twins.items() if key[0] != position}
-                found |= conditioner.counts(rows, formula_values)
+                counts_by_name |= conditioner.counts(rows, formula_values)
                 continue
             # Twins first: they start from the state of the healthy chain before these rows.
             rate = conditioner.groups[0].rate_hz
@@ -333,8 +333,8 @@ class FaultInjector:
                     values = fault.what.counts(values, make_place(fault, channel, n, t))
                 most = 2.0 ** (channel.adc_bits - 1)
                 counts[group][:, c] = np.clip(values, -most, most - 1.0)
-            found |= counts
-        return found
+            counts_by_name |= counts
+        return counts_by_name
 
     def edges(self, edges: np.ndarray, rows: np.ndarray, tick: int) -> np.ndarray:
         """Return the keyphasor edges with faults [ticks from the first row], shape (edges,).
@@ -363,12 +363,12 @@ class FaultInjector:
         next_rows = np.ceil(edges / self.row_ticks).astype(int)
         rate = np.where(np.isnan(rate), rows[np.minimum(next_rows, len(rows) - 1), COLUMN["theta_rate"]], rate)
         turns = np.rint(np.interp(edges, self.row_ticks * np.arange(len(rows)), rows[:, COLUMN["theta"]]) / TURN) * TURN
-        found = true_edges
+        shown_edges = true_edges
         for fault, mark in faults:
-            in_fault = (found >= fault.begin) & (found < fault.end)
+            in_fault = (shown_edges >= fault.begin) & (shown_edges < fault.end)
             here, nearest = (
-                found[in_fault],
-                np.maximum(np.searchsorted(true_edges, found[in_fault], side="right") - 1, 0),
+                shown_edges[in_fault],
+                np.maximum(np.searchsorted(true_edges, shown_edges[in_fault], side="right") - 1, 0),
             )
             angles, rates = turns[nearest], rate[nearest]
             if tick <= fault.begin < end:
@@ -390,16 +390,16 @@ class FaultInjector:
             shown = np.rint(fault.what.edges(here, instants) * FRACTIONS) / FRACTIONS
             # As with the signal, the true edges apply after the end of the fault.
             shown = shown[(shown >= fault.begin) & (shown < fault.end)]
-            found = np.sort(np.concatenate([found[~in_fault], shown]))
-        found = np.sort(np.concatenate([self._held, found]))
-        self._held = found[found >= end]
-        return found[found < end] - tick
+            shown_edges = np.sort(np.concatenate([shown_edges[~in_fault], shown]))
+        shown_edges = np.sort(np.concatenate([self._held, shown_edges]))
+        self._held = shown_edges[shown_edges >= end]
+        return shown_edges[shown_edges < end] - tick
 
     def _twin_counts(
         self, position: int, conditioner: Conditioner, plan: Plan, volts: Volts, n: np.ndarray, tick: int
     ) -> dict[str, np.ndarray]:
         """Return the counts of channels that differ before the converter, each of shape (samples,)."""
-        found: dict[str, np.ndarray] = {}
+        counts: dict[str, np.ndarray] = {}
         for fine, faulty in plan.twins.items():
             twin = self._twin((position, fine), conditioner, faulty, tick)
             if twin is None:
@@ -408,8 +408,8 @@ class FaultInjector:
             (values,) = twin.conditioner.counts(volts.rows, volts.signals(names)).values()
             if fine:
                 values = self._delay_samples(twin, values, n, list(faulty.values()))
-            found |= zip(names, values.T, strict=True)
-        return found
+            counts |= zip(names, values.T, strict=True)
+        return counts
 
     def _twin(
         self, key: tuple[int, bool], conditioner: Conditioner, faulty: dict[str, list[Active]], tick: int

@@ -78,13 +78,13 @@ class Pick(Written):
         engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
         if self.companion is not None:
             engine["companion"] = self.companion
-        given = dict(get_table(data, "engine"))
+        scene_engine = dict(get_table(data, "engine"))
         if self.companion is False:
-            given.pop("limits", None)  # without a companion there is no error estimate to limit
+            scene_engine.pop("limits", None)  # without a companion there is no error estimate to limit
         return {
             **data,
             "model": levels,
-            "engine": {**given, **engine},
+            "engine": {**scene_engine, **engine},
             "drive": {**get_table(data, "drive"), "mode": self.drive},
             "sensors": {**get_table(data, "sensors"), "chain": self.sensors},
         }
@@ -104,19 +104,19 @@ def equations_digest(rig: Path = _RIG) -> str:
     Args:
         rig: Folder of the package.
     """
-    found: dict[str, bytes] = {}
+    code_by_name: dict[str, bytes] = {}
     waiting = [rig / "physics" / name for name in ("model.py", "kernels", "engines")]
     while waiting:
         place = waiting.pop()
         for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
             name = file.relative_to(rig).as_posix()
-            if name in found:
+            if name in code_by_name:
                 continue
             # Line ends differ between systems.
-            found[name] = file.read_bytes().replace(b"\r\n", b"\n")
-            used = _modules_used(found[name]) - {*_WORDS}
+            code_by_name[name] = file.read_bytes().replace(b"\r\n", b"\n")
+            used = _modules_used(code_by_name[name]) - {*_WORDS}
             waiting += [rig / each if (rig / each).is_dir() else rig / f"{each}.py" for each in sorted(used)]
-    return digest(*(part for name in sorted(found) for part in (name.encode(), found[name])))
+    return digest(*(part for name in sorted(code_by_name) for part in (name.encode(), code_by_name[name])))
 
 
 def _modules_used(code: bytes) -> set[str]:

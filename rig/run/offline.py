@@ -113,15 +113,15 @@ class Run:
     @property
     def groups(self) -> dict[str, Samples]:
         """Readings of the sensors by group."""
-        found = {}
+        groups = {}
         for name, group in self.table.groups.items():
             table = next(table for table in self.sampled if group.names[0] in table.names)
             first = table.names.index(group.names[0])
             part = slice(first, first + len(group.names))
-            found[name] = replace(
+            groups[name] = replace(
                 table, name=name, values=table.values[:, part], names=group.names, units=table.units[part]
             )
-        return found
+        return groups
 
     @property
     def table(self) -> ChannelTable:

@@ -141,10 +141,10 @@ class Scene(Written):
     def _check_sensors(self) -> Scene:
         if self.channels is not None:
             check_table(self.channels)
-        known = (self.channels or rig_table()).groups
+        groups = (self.channels or rig_table()).groups
         for name in self.sensors.groups:
-            if name not in known or self.sensors.groups.count(name) > 1:
-                raise InputError("sensors.groups", f"a list of different names out of {', '.join(known)}", name)
+            if name not in groups or self.sensors.groups.count(name) > 1:
+                raise InputError("sensors.groups", f"a list of different names out of {', '.join(groups)}", name)
         self.formulas().check(self.table)
         check_rates(self.table, 1_000_000 // self.row_ticks, field="sensors.rate_hz" if self.sensors.rate_hz else "")
         return self
@@ -390,9 +390,9 @@ def pick_digests(scene: Scene) -> tuple[str, str, str]:
     """Return the digests that a pick depends on: the scene, its parameters, and equations and engines."""
     # Name and noise seed do not change the motion of a scene.
     left_out = {"name", "title", "seed", "parameters", "set", "model", "engine", "fidelity", "pick", "generator"}
-    given = scene.model_dump_json(exclude=left_out)
+    scene_text = scene.model_dump_json(exclude=left_out)
     values = {key: [entry.value, entry.unit] for key, entry in scene.load_parameters().entries.items()}
-    return digest(given.encode()), digest(json.dumps(values, sort_keys=True).encode()), equations_digest()
+    return digest(scene_text.encode()), digest(json.dumps(values, sort_keys=True).encode()), equations_digest()
 
 
 def parse_scene(data: dict[str, Any]) -> Scene:
@@ -411,11 +411,11 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
     *path, last = key.split(".")
     fields: Any = Scene
     for part in [*path, last]:
-        known = _inner(fields)
-        if part not in known:
-            known = [*_scene_keys(), *load_parameters().entries]
-            raise InputError(key, such_as("a field of a scene or a parameter", key, known), value)
-        fields = known[part].annotation
+        names = _inner(fields)
+        if part not in names:
+            names = [*_scene_keys(), *load_parameters().entries]
+            raise InputError(key, such_as("a field of a scene or a parameter", key, names), value)
+        fields = names[part].annotation
     table = data
     for part in path:
         table[part] = dict(get_table(table, part))

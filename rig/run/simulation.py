@@ -442,14 +442,14 @@ class Simulation:
         return self.faults.counts(rows, self._formulas.values(rows), tick)
 
     def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
-        found = {}
+        blocks = {}
         for name, group in self.table.groups.items():
             values = counts[0][name] if len(counts) == 1 else np.concatenate([part[name] for part in counts])
             # The first sample at or after the start, to the nearest tick.
             index = -(-start * group.rate_hz // TICK_RATE_HZ)
             tick = round(index * TICK_RATE_HZ / group.rate_hz)
-            found[name] = self._block(tick, index, group.rate_hz, values)
-        return found
+            blocks[name] = self._block(tick, index, group.rate_hz, values)
+        return blocks
 
     def _edges(self, rows: np.ndarray, start: int) -> Block | None:
         if self._keyphasor is None:

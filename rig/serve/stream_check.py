@@ -154,14 +154,14 @@ class Catalogue(BaseModel):
     def get_formats(self) -> dict[str, StreamFormat]:
         """Return the properties of the declared streams, by key."""
         ticks = self.tick_rate_hz
-        found = {wire.EDGES: StreamFormat(1, 0.0, ticks)}
+        formats = {wire.EDGES: StreamFormat(1, 0.0, ticks)}
         for name, group in self.table.groups.items():
-            found[wire.sensor_key(name)] = StreamFormat(
+            formats[wire.sensor_key(name)] = StreamFormat(
                 len(group.channels), self.rates_hz.get(name, float(group.rate_hz)), ticks
             )
         for name, table in self.truth.items():
-            found[wire.truth_key(name)] = StreamFormat(len(table.columns), table.rate_hz, ticks)
-        return found
+            formats[wire.truth_key(name)] = StreamFormat(len(table.columns), table.rate_hz, ticks)
+        return formats
 
 
 class AcceptedBlock(NamedTuple):
@@ -263,18 +263,18 @@ class BlockValidator:
 
         Blocks that a fault duplicates, reorders or stamps with other times are valid only if declared.
         """
-        found = list[AcceptedBlock]()
+        accepted_blocks = list[AcceptedBlock]()
         if not self._rows.declare(document):
-            return found
+            return accepted_blocks
         for blocks in (*self._refused_blocks.values(), *self._waiting.values()):
             for block in list(blocks):
                 if self._rows.knows(block.key, block.block):
-                    found += self._accept([block])
-            remaining = [block for block in blocks if all(block is not accepted for accepted in found)]
+                    accepted_blocks += self._accept([block])
+            remaining = [block for block in blocks if all(block is not accepted for accepted in accepted_blocks)]
             self.refused -= len(blocks) - len(remaining) if isinstance(blocks, deque) else 0
             blocks.clear()
             blocks.extend(remaining)
-        return found
+        return accepted_blocks
 
     def take_waiting(self, rows: Mapping[str, int] | None, key: str | None = None) -> list[AcceptedBlock]:
         """Return the waiting blocks that were published, at the end of the stream.
@@ -283,12 +283,12 @@ class BlockValidator:
             rows: Index after the last published row, by key; None if unknown.
             key: Only this stream.
         """
-        found = []
+        accepted_blocks = []
         for name in list(self._waiting) if key is None else [key]:
             last = None if rows is None else rows.get(name, 0)
-            while taken := self._take_next(name, last=last):
-                found += taken
-        return found
+            while accepted := self._take_next(name, last=last):
+                accepted_blocks += accepted
+        return accepted_blocks
 
     def _take_next(self, key: str, *, last: int | None = None, allow_earlier: bool = False) -> list[AcceptedBlock]:
         """Return the next waiting block ahead, up to row `last`; otherwise, if `allow_earlier`, the first one back."""

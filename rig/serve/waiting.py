@@ -191,11 +191,11 @@ class BoundedQueue(Generic[T]):
             if not self._items:
                 self._changed.wait_for(lambda: self._items or self.closed, timeout_s)
             items = [self._items.popleft() for _ in range(min(most, len(self._items)))]
-            taken = sum(map(self._size, items))
+            size = sum(map(self._size, items))
             if self._holds:
-                self._held = taken
+                self._held = size
             else:
-                self.used -= taken
+                self.used -= size
             self._changed.notify_all()
             return items
 

@@ -27,7 +27,7 @@ BUDGETS = {
     "drivers/instruments": 845,
     "drivers/link": 572,
     "drivers/protection": 350,
-    "drivers/sources": 962,
+    "drivers/sources": 967,
     "recorder": 1339,
     "recorder/contents": 1266,
     "recorder/files": 783,

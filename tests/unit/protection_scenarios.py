@@ -391,11 +391,11 @@ class EventRig(FakeMachine):
 
 @scenario
 def a_note_of_others_resets_alarms(device: Any) -> None:
-    blow, still = make_swing(200, (100, 1200.0), (150, 0.0)), np.zeros(200)
+    impact, still = make_swing(200, (100, 1200.0), (150, 0.0)), np.zeros(200)
     command = {"event": "speed", "speed_hz": 1.0}
     for tags, expected in ((["reset"], ["reset", "reset"]), (["protection", "reset"], []), (["again"], [])):
         machine = EventRig(
-            ([], samples(disk_x=blow, disk_y=0.0)),
+            ([], samples(disk_x=impact, disk_y=0.0)),
             ([command, {"event": "note", "tags": tags}], samples(200, disk_x=still, disk_y=0.0)),
             ([], samples(400, disk_x=still, disk_y=0.0)),
         )

@@ -59,8 +59,8 @@ class Synthetic:
         rng = np.random.default_rng(seed)
         self.force_n = np.where(self.times_s < self.hit_s, 0.0, 523.0)
         pull = self.force_n * np.exp(1j * np.angle(self.z))
-        blow = (self.times_s >= self.hit_s) & (self.times_s < self.hit_s + 5e-3)
-        half_sine = np.where(blow, 100.0 * np.sin(math.pi * (self.times_s - self.hit_s) / 5e-3), 0.0)
+        impact = (self.times_s >= self.hit_s) & (self.times_s < self.hit_s + 5e-3)
+        half_sine = np.where(impact, 100.0 * np.sin(math.pi * (self.times_s - self.hit_s) / 5e-3), 0.0)
         speed = np.full_like(self.times_s, 6.2)
         noise = {"probes": 1.3e-4, "forces": 0.5, "accelerations": 0.05, "drive": 2e-3, "hammer": 0.04}
         clean = {

@@ -360,14 +360,14 @@ class Hub(Closing):
 
     def _reports(self, now: int) -> list[codec.NodeReport]:
         """Return the reports that have changed, after removing endpoints that have left."""
-        found = []
+        changed = []
         self.endpoints.remove_departed()
         for endpoint in self.endpoints:
             report = self.endpoints.report(endpoint)
             before, endpoint.reported = endpoint.reported, report
             if report == before:
                 continue
-            found.append(report)
+            changed.append(report)
             # The node may have recovered since the last report.
             bus_offs = self._model.node(endpoint.node).bus_offs
             if bus_offs > endpoint.bus_offs:
@@ -378,7 +378,7 @@ class Hub(Closing):
                 self._queue_state_change(now, report, codec.RESTARTED, 0)
             elif report.state != state:
                 self._queue_state_change(now, report, codec.CONTROLLER, _CONTROLLER_STATES[report.state])
-        return found
+        return changed
 
     def _queue_state_change(self, now: int, report: codec.NodeReport, kind: int, detail: int) -> None:
         """Queue an error frame about one node's controller."""

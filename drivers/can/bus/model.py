@@ -319,6 +319,6 @@ class BusModel:
 
 def _extend(array: np.ndarray, rows: int) -> np.ndarray:
     """Return the rows followed by rows of zeros."""
-    found = np.zeros((rows, *array.shape[1:]), array.dtype)
-    found[: len(array)] = array
-    return found
+    extended = np.zeros((rows, *array.shape[1:]), array.dtype)
+    extended[: len(array)] = array
+    return extended

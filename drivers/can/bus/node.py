@@ -375,7 +375,7 @@ def match_filters(words: np.ndarray, filters: CanFilters) -> np.ndarray:
     """Return for each identifier word whether it matches at least one filter, shape of `words`."""
     extended = (words & codec.EXTENDED) != 0
     identifiers = words & np.uint32(codec.EXTENDED_MASK)
-    found = np.zeros(len(words), bool)
+    matches = np.zeros(len(words), bool)
     for entry in filters:
         wanted, mask = int(entry["can_id"]), int(entry["can_mask"])
         # As in python-can, the mask bits beyond an identifier's 29 bits are compared with zeros.
@@ -385,5 +385,5 @@ def match_filters(words: np.ndarray, filters: CanFilters) -> np.ndarray:
         match = identifiers & np.uint32(mask) == wanted & mask
         if "extended" in entry:
             match &= extended == bool(entry["extended"])
-        found |= match
-    return found
+        matches |= match
+    return matches

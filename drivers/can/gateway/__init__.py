@@ -133,7 +133,7 @@ class Gateway(Closing):
         self._event_number = 0
         self._next_status_s = self._next_heartbeat_s = now()
 
-        self.taken = 0
+        self.fault_skipped = 0
         """Frames that a fault of blocks prevented: it removed their samples, or sent them out of order."""
         self._fault_ends: dict[str, int] = {}
         """First row number after the rows affected by such a fault, by group."""
@@ -217,7 +217,7 @@ class Gateway(Closing):
     @property
     def dropped(self) -> int:
         """Frames that the bus did not accept, or that were never built because samples were missing."""
-        return self.outbox.dropped + sum(each.skipped for each in self._samples) - self.taken
+        return self.outbox.dropped + sum(each.skipped for each in self._samples) - self.fault_skipped
 
     # ---- on the publisher's thread ----
 
@@ -307,7 +307,7 @@ class Gateway(Closing):
                 last, data = complete
                 self.outbox.put(each.message, data, last / self._rate_hz)
             if any(block.index <= self._fault_ends.get(name, -1) for name in each.columns):
-                self.taken += each.skipped - skipped
+                self.fault_skipped += each.skipped - skipped
         if group == self._groups[0]:
             self._sync(block)
 

@@ -99,21 +99,21 @@ def find_decimations(table: ChannelTable, schedule: Schedule) -> tuple[int, dict
     if len(rates) != 1:
         raise InputError("sample rates", "the same for all channel groups on a CAN bus", sorted(rates))
     rate = rates.pop()
-    known = {channel.name: channel for row in schedule.table.fd if row.samples for channel in row.samples.channels}
-    if (name := find_mismatch(table, known)) is not None:
+    can_channels = {each.name: each for row in schedule.table.fd if row.samples for each in row.samples.channels}
+    if (name := find_mismatch(table, can_channels)) is not None:
         raise InputError(f"channel {name}", "calibrated as in the channel table of the messages", name)
-    found = {}
+    decimations = {}
     for fd, wanted in ((True, schedule.fd_hz), (False, schedule.classic_hz)):
         if wanted is not None:
             if rate % wanted:
                 raise InputError("--can-rate", f"a divisor of the samples' rate, {rate} Hz", wanted)
-            found[fd] = rate // wanted
-    return rate, found
+            decimations[fd] = rate // wanted
+    return rate, decimations
 
 
 def make_sample_frames(table: ChannelTable, schedule: Schedule, decimations: dict[bool, int]) -> list[SampleFrames]:
     """Return the builders of all sample messages that are sent, with the channels that the rig has."""
-    found = []
+    builders = []
     for message in (*schedule.table.fd, *schedule.table.classic):
         if message.samples is None or message.fd not in decimations:
             continue
@@ -123,8 +123,8 @@ def make_sample_frames(table: ChannelTable, schedule: Schedule, decimations: dic
             if group in table.groups
         }
         if columns:
-            found.append(SampleFrames(message, decimations[message.fd], columns))
-    return found
+            builders.append(SampleFrames(message, decimations[message.fd], columns))
+    return builders
 
 
 def make_records(message: CanMessage, data: np.ndarray) -> np.ndarray:

@@ -33,11 +33,11 @@ class Datasheet(BaseModel, frozen=True, extra="forbid"):
         Raises:
             InputError: The channel does not exist.
         """
-        known = {channel.name: channel for channel in self.channels}
+        channels = {channel.name: channel for channel in self.channels}
         for name in names or ():
-            if name not in known:
-                raise InputError("channel", f"one of {', '.join(known)}", name)
-        chosen = self.channels if names is None else tuple(known[name] for name in names)
+            if name not in channels:
+                raise InputError("channel", f"one of {', '.join(channels)}", name)
+        chosen = self.channels if names is None else tuple(channels[name] for name in names)
         return Group(name=self.model, title=self.title, rate_hz=self.rate_hz or 1, channels=chosen)
 
 

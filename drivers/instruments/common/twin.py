@@ -109,8 +109,7 @@ class Twin:
             InputError: The rig refused the command.
             NoReplyError: No rig replies.
         """
-        values = asdict(command).items()
-        fields = {name: as_number(value) if isinstance(value, str) else value for name, value in values}
+        fields = {key: as_number(value) if isinstance(value, str) else value for key, value in asdict(command).items()}
         return self._console.send(command.COMMAND, **fields)
 
     def _execute(self, request: InstrumentMessage) -> InstrumentMessage:

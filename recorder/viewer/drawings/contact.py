@@ -32,15 +32,15 @@ class Touch:
     def changes(self, times_s: np.ndarray, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the instants of change [s] and the new states (bool); the first known state counts as a change."""
         decided = np.where(quantity >= self._enter, 1, np.where(quantity < self._leave, 0, -1))
-        known = np.flatnonzero(decided >= 0)
+        decided_rows = np.flatnonzero(decided >= 0)
         before = self.state
-        if not len(known):
+        if not len(decided_rows):
             return times_s[:0], np.zeros(0, dtype=bool)
-        states = decided[known].astype(bool)
+        states = decided[decided_rows].astype(bool)
         previous = np.concatenate(([not states[0] if before is None else before], states[:-1]))
         changed = states != previous
         self.state = bool(states[-1])
-        return times_s[known][changed], states[changed]
+        return times_s[decided_rows][changed], states[changed]
 
 
 class ContactPlot:

@@ -44,15 +44,15 @@ class Geometry:
             document: `{"values": {key: {"value", "unit"}}}`, or None.
         """
         values = (document or {}).get("values", {})
-        found: dict[str, float] = {}
+        lengths: dict[str, float] = {}
         for name, key in _KEYS.items():
             entry = values.get(key)
             if not isinstance(entry, Mapping) or entry.get("unit") not in _UNITS:
                 continue
             value = entry.get("value")
             if isinstance(value, int | float) and value > 0.0:
-                found[name] = value * _UNITS[entry["unit"]]
-        return cls(**found, assumed=tuple(key for name, key in _KEYS.items() if name not in found))
+                lengths[name] = value * _UNITS[entry["unit"]]
+        return cls(**lengths, assumed=tuple(key for name, key in _KEYS.items() if name not in lengths))
 
     @property
     def disk_clearance_m(self) -> float:

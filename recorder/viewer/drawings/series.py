@@ -58,7 +58,7 @@ def build_curves(group: Group) -> list[Curves]:
     for column, channel in enumerate(group.channels):
         if channel.name not in _HIDDEN_CHANNELS:
             planes.setdefault(channel.name.split("_")[0], []).append(column)
-    found = [
+    curves = [
         Curves(
             path=f"{ROOT}/{group.name}/{plane}",
             labels=tuple(f"{group.channels[column].name} [{group.channels[column].unit}]" for column in columns),
@@ -68,7 +68,7 @@ def build_curves(group: Group) -> list[Curves]:
         for plane, columns in planes.items()
     ]
     if set(group.names) >= REACTIONS:
-        found.append(
+        curves.append(
             Curves(
                 path=REACTION,
                 labels=("x: P_E - P_W [N]", "y: P_N - P_S [N]"),
@@ -76,7 +76,7 @@ def build_curves(group: Group) -> list[Curves]:
                 select=find_reaction(group),
             )
         )
-    return found
+    return curves
 
 
 def _get_color(name: str) -> tuple[int, int, int]:

@@ -146,11 +146,11 @@ class Grammar:
             case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
                 return apply(_OPERATORS[type(op)], inner(left), inner(right))
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
-                known = self.functions()
-                if name not in known:
-                    raise UnknownNameError(field, "a formula with the functions", name, known)
-                if len(args) != known[name]:
-                    raise InputError(field, f"{name} of {known[name]} argument{'s' * (known[name] > 1)}", len(args))
+                arity = self.functions()
+                if name not in arity:
+                    raise UnknownNameError(field, "a formula with the functions", name, arity)
+                if len(args) != arity[name]:
+                    raise InputError(field, f"{name} of {arity[name]} argument{'s' * (arity[name] > 1)}", len(args))
                 return self.call(name, [inner(each) for each in args], field)
         raise InputError(field, f"a formula with {self.made_of}", text[:60])
 

@@ -57,15 +57,15 @@ def find_channels(
     """
     if isinstance(what, BlockFault):
         return ()
-    known = table.channels
-    if target not in {*known, *table.groups}:
+    channels = table.channels
+    if target not in {*channels, *table.groups}:
         must = "one of the channels, or of their groups"
-        raise UnknownNameError("fault.channel", must, target, [*known, *table.groups])
+        raise UnknownNameError("fault.channel", must, target, [*channels, *table.groups])
     names = table.groups[target].names if target in table.groups else (target,)
     for other in what.reads:
-        if other not in known or other in names:
+        if other not in channels or other in names:
             raise UnknownNameError(
-                f"fault.{what.name()}", "with another channel", other, [n for n in known if n not in names]
+                f"fault.{what.name()}", "with another channel", other, [n for n in channels if n not in names]
             )
     refused = list_refusals(type(what), table, Setting(ideal, noisy, generated))
     if what.channel_only:
@@ -77,32 +77,31 @@ def find_channels(
         if must := refused[name]:
             pulses = must.endswith("pulses")
             raise InputError("fault.channel" if pulses else "kind", must, target if pulses else what.name())
-        what.refuse(known[name])
+        what.refuse(channels[name])
     return names
 
 
-def find_group(what: BlockFault, target: str, table: ChannelTable, transports: tuple[str, ...]) -> str:
+def find_group(what: BlockFault, target: str, table: ChannelTable, buses: tuple[str, ...]) -> str:
     """Return the group whose blocks a fault changes.
 
     Args:
         what: The fault.
         target: A group.
         table: Channel table.
-        transports: Transports of the rig by which blocks are sent.
+        buses: Transports of the rig by which blocks are sent.
 
     Raises:
         InputError: The group or the transport is unknown; the message lists the known ones.
     """
-    known = list_refusals(type(what), table)
-    if target in table.channels and target not in known:
+    refusals = list_refusals(type(what), table)
+    if target in table.channels and target not in refusals:
         must = f"a group for {what.name()}, as a block has all its channels, such as {table.channels[target].group}"
         raise InputError("fault.channel", must, target)
-    if target not in known:
-        raise UnknownNameError("fault.channel", f"one of the groups for {what.name()}", target, known)
-    if not set(what.transports) & set(transports):
-        must = f"one that this rig has: {', '.join(transports)} (a CAN bus: rig run --can)"
-        raise InputError("door", must, what.door)
-    if must := what.needs_at(what.door, target, tuple(known)):
+    if target not in refusals:
+        raise UnknownNameError("fault.channel", f"one of the groups for {what.name()}", target, refusals)
+    if not set(what.transports) & set(buses):
+        raise InputError("door", f"one that this rig has: {', '.join(buses)} (a CAN bus: rig run --can)", what.door)
+    if must := what.needs_at(what.door, target, tuple(refusals)):
         raise InputError("fault.channel", must, target)
     return target
 
@@ -114,7 +113,7 @@ def describe_kinds(table: ChannelTable, setting: Setting = Setting()) -> list[tu
         table: Channel table.
         setting: Properties of the scene.
     """
-    found: list[tuple[str, ...]] = []
+    rows: list[tuple[str, ...]] = []
     for name, kind in KINDS.items():
         numbers = [
             key + ("" if field.is_required() else f" ({'none' if field.default is None else _text(field.default)})")
@@ -133,8 +132,8 @@ def describe_kinds(table: ChannelTable, setting: Setting = Setting()) -> list[tu
             transports += ", or one" + "".join(
                 f" ({door} alone: {', '.join(there)})" for door, there in some.items() if len(there) < len(groups)
             )
-        found.append((name, kind.stage, doc, ", ".join(numbers) or "none", where, transports))
-    return found
+        rows.append((name, kind.stage, doc, ", ".join(numbers) or "none", where, transports))
+    return rows
 
 
 def _text(value: object) -> str:

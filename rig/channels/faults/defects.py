@@ -63,12 +63,12 @@ def size_text(name: str, value: float, unit: str = "") -> str:
 
 def defects_in(words: str) -> tuple[str, ...]:
     """Return the names in the table of the defects in a validation's wording."""
-    found = list[str]()
+    names = list[str]()
     for part in alternatives(words):
-        found += [one for one in part.split(" and ") if one in DEFECTS] or [
+        names += [one for one in part.split(" and ") if one in DEFECTS] or [
             name for name, each in DEFECTS.items() if part in each.validation
         ]
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(names))
 
 
 def defects_shown(failed: Collection[str], *, digital: bool) -> list[str]:

@@ -178,24 +178,24 @@ class Sending:
 
 def _apply_faults(message: Message, faults: list[Active]) -> list[_Held]:
     """Return the messages that a block becomes after some faults in turn."""
-    found = [_Held(message)]
+    after = [_Held(message)]
     now = message.row * TICKS_HZ // round(message.block.rate_hz)
     for one in faults:
         assert isinstance(one.what, BlockFault)
         row = first_row(one.begin, round(message.block.rate_hz))
         first = row, round(row * TICKS_HZ / message.block.rate_hz)
         u = float(one.draws[""].uniform(np.array([(now - one.begin) // one.what.ticks]))[0, 0])
-        before, found, targets = found, [], one.what.transports
+        before, after, targets = after, [], one.what.transports
         for held in before:
             inside, outside = (
                 tuple(each for each in held.message.transports if (each in targets) == acts) for acts in (True, False)
             )
             if outside:
-                found.append(replace(held, message=held.message._replace(transports=outside)))
+                after.append(replace(held, message=held.message._replace(transports=outside)))
             if inside:
                 results = one.what.sent(held.message._replace(transports=inside), u, first)
-                found += [_Held(each, (*held.by, one) if each.due != held.message.due else held.by) for each in results]
-    return found
+                after += [_Held(each, (*held.by, one) if each.due != held.message.due else held.by) for each in results]
+    return after
 
 
 def _describe_blocks(piece: Block, key: str, faults: list[Active], results: list[_Held]) -> dict[str, Any]:

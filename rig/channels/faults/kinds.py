@@ -148,7 +148,7 @@ class Resonance(Kind, number=14):
         goes_on = before is not None and t is not None and times[0] > t + 1e-9
         if goes_on:
             values, times = [before, *values], [t, *times]
-        found = [z]
+        states = [z]
         if len(values) > 1:
             step = p * round(1e9 * (times[1] - times[0])) * 1e-9
             turn = math.exp(step.real) * complex(math.cos(step.imag), math.sin(step.imag))
@@ -156,9 +156,9 @@ class Resonance(Kind, number=14):
             first = r / p * (turn - 1.0) - second
             for one, other in pairwise(values):
                 z = turn * z + first * one + second * other
-                found.append(z)
+                states.append(z)
         at.kept.update(zip(names, (z.real, z.imag, values[-1], times[-1]), strict=True))
-        return 2.0 * np.real(found[1:] if goes_on else found)
+        return 2.0 * np.real(states[1:] if goes_on else states)
 
 
 # ---- cable and conditioner ----
@@ -292,12 +292,12 @@ class _ActiveFault(Protocol):
 
 def connect_swaps(active: Iterable[_ActiveFault]) -> dict[str, str]:
     """Return the channel whose conditioner each swapped channel is connected to, after all swaps in their order."""
-    found: dict[str, str] = {}
+    connections: dict[str, str] = {}
     for one in active:
         if isinstance(one.what, Swap):
             a, b = one.names
-            found[a], found[b] = found.get(b, b), found.get(a, a)
-    return found
+            connections[a], connections[b] = connections.get(b, b), connections.get(a, a)
+    return connections
 
 
 # ---- filter ----

@@ -89,13 +89,13 @@ class Declared(Continuity):
     def declare(self, document: Mapping[str, Any]) -> bool:
         """Register a document on faults, of blocks sent by zenoh. Return whether it is such a document."""
         try:
-            found = check(_Document, dict(document), field="faults")
+            declaration = check(_Document, dict(document), field="faults")
         except InputError:
             return False
-        for one in found.blocks:
+        for one in declaration.blocks:
             if one.key not in self._known and len(self._known) >= _MAX_STREAMS:
                 continue
-            sent, known = [each for each in one.sent if "zenoh" in each.doors], self._known.setdefault(one.key, {})
+            sent, blocks = [each for each in one.sent if "zenoh" in each.doors], self._known.setdefault(one.key, {})
             if not sent:
                 dropped = self._dropped.setdefault(one.key, deque(maxlen=_MAX_PENDING))
                 if dropped and sum(dropped[-1]) == one.row:
@@ -109,9 +109,9 @@ class Declared(Continuity):
                     self._undeclared[one.key].remove(which)
                     self._correct(one.key, each.index + one.rows, one.row + one.rows)
                 else:
-                    known.setdefault(which, [one.row, 0])[1] += 1
-            while len(known) > _MAX_PENDING:
-                del known[next(iter(known))]
+                    blocks.setdefault(which, [one.row, 0])[1] += 1
+            while len(blocks) > _MAX_PENDING:
+                del blocks[next(iter(blocks))]
             self._count_dropped(one.key)
         return True
 
@@ -121,16 +121,16 @@ class Declared(Continuity):
 
     def true(self, key: str, block: Block) -> Block:
         """Return a block with the true number and tick of its rows."""
-        found = self._known.get(key, {}).get((block.index, block.tick, len(block.values)))
-        if found is None or found[0] == block.index:
-            tick = None if found is None else round(block.index * block.tick_rate_hz / block.rate_hz)
+        declared = self._known.get(key, {}).get((block.index, block.tick, len(block.values)))
+        if declared is None or declared[0] == block.index:
+            tick = None if declared is None else round(block.index * block.tick_rate_hz / block.rate_hz)
             return block if tick is None else replace(block, tick=tick)
-        return replace(block, index=found[0], tick=round(found[0] * block.tick_rate_hz / block.rate_hz))
+        return replace(block, index=declared[0], tick=round(declared[0] * block.tick_rate_hz / block.rate_hz))
 
     def take(self, key: str, block: Block) -> Gap | None:
         """Count the next block. Return the gap before it; None without a gap, or if a late block is declared."""
-        known, rows = self._known.get(key, {}), len(block.values)
-        declared = known.get(which := (block.index, block.tick, rows))
+        blocks, rows = self._known.get(key, {}), len(block.values)
+        declared = blocks.get(which := (block.index, block.tick, rows))
         row = block.index if declared is None else declared[0]
         due = self.next.get(key, row)
         self._first.setdefault(key, due)
@@ -148,7 +148,7 @@ class Declared(Continuity):
                 self._count_late(key, row, rows)
             declared[1] -= 1
             if not declared[1]:
-                del known[which]
+                del blocks[which]
         self._count_dropped(key)
         return gap
 

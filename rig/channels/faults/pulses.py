@@ -60,9 +60,9 @@ class EdgeJitter(Kind, number=29):
         return late_v(channel, 2e-6 * SIGMAS * self.rms_us)
 
     def _late_s(self, at: At) -> np.ndarray:
-        turns, known = _number_turns(at)
-        late_s = 1e-6 * self.rms_us * (SIGMAS + np.clip(at.draw.normal(known), -SIGMAS, SIGMAS))
-        return late_s[turns - known[0]]
+        turns, turn_range = _number_turns(at)
+        late_s = 1e-6 * self.rms_us * (SIGMAS + np.clip(at.draw.normal(turn_range), -SIGMAS, SIGMAS))
+        return late_s[turns - turn_range[0]]
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         return at.mark(at.angle - at.rate * self._late_s(at))
@@ -79,8 +79,8 @@ def _number_turns(at: At) -> tuple[np.ndarray, np.ndarray]:
 
 def _select_rows(at: At, part: float) -> np.ndarray:
     """Return whether the fault selects each row's turn, shape (n,)."""
-    turns, known = _number_turns(at)
-    return (at.draw.uniform(known)[:, 0] < part)[turns - known[0]]
+    turns, turn_range = _number_turns(at)
+    return (at.draw.uniform(turn_range)[:, 0] < part)[turns - turn_range[0]]
 
 
 PulseKind = MissPulses | ExtraPulses | EdgeJitter

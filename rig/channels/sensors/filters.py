@@ -38,7 +38,7 @@ def channel_poles(channel: Channel, row_rate_hz: float = math.inf) -> tuple[np.n
         highpass = (1.0 - _MIN_CORNER_GAP) * corner
     angles = [math.pi * (2 * n + order + 1) / (2 * order) for n in range(order)]
     low = [corner * complex(math.cos(angle), math.sin(angle)) for angle in angles]
-    found, residues = [], []
+    poles, residues = [], []
     for n, pole in enumerate([*low, complex(-highpass)] if highpass else low):
         if pole.imag < -1e-9 * abs(pole):
             continue  # complex conjugate
@@ -47,9 +47,9 @@ def channel_poles(channel: Channel, row_rate_hz: float = math.inf) -> tuple[np.n
             residue *= corner / (pole - other) if m != n else corner
         if n < order and highpass:
             residue /= pole + highpass
-        found.append(pole)
+        poles.append(pole)
         residues.append(residue * (2.0 if pole.imag > 1e-9 * abs(pole) else 1.0))
-    return np.array(found, complex), np.array(residues, complex), 0.0 if low else 1.0
+    return np.array(poles, complex), np.array(residues, complex), 0.0 if low else 1.0
 
 
 def _integrals(poles: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -35,21 +35,21 @@ class Keyphasor:
             Instants in ticks from the first of these rows, with fraction, shape (edges,). Negative ones lie between the
             last row of the previous call and the first of this one.
         """
-        found = np.empty(len(rows))
-        count = _edges(rows, row_ticks, self._last, found)
+        edges = np.empty(len(rows))
+        count = _edges(rows, row_ticks, self._last, edges)
         self.edges_seen += count
-        return found[:count]
+        return edges[:count]
 
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
-def _edges(rows, row_ticks, last, found):
+def _edges(rows, row_ticks, last, edges):
     """Return the number of edges, at most one per row interval.
 
     Args:
         rows: Observed rows, shape (n, N_ROW).
         row_ticks: Ticks per row interval.
         last: Angle and rate of the previous row, in and out, shape (2,).
-        found: Instants [ticks], out, shape (n,).
+        edges: Instants [ticks], out, shape (n,).
     """
     count = 0
     angle, rate = last[0], last[1]
@@ -62,7 +62,7 @@ def _edges(rows, row_ticks, last, found):
             step = row_ticks * 1e-6
             mark = turns * TURN
             part = _crossing(angle_before - mark, angle - mark, rate_before * step, rate * step)
-            found[count] = (n - 1) * row_ticks + np.rint(part * row_ticks * FRACTIONS) / FRACTIONS
+            edges[count] = (n - 1) * row_ticks + np.rint(part * row_ticks * FRACTIONS) / FRACTIONS
             count += 1
     last[0], last[1] = angle, rate
     return count

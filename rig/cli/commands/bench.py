@@ -29,9 +29,9 @@ def bench(
     console.print(cases_table(report, runs=runs))
     if report["missing_peers"]:
         console.print(f"not timed: {', '.join(report['missing_peers'])} (pip install 'rotor-stator-rig[peers]')")
-    known = report["reference"]
-    doubt = "" if known["error"] is None else f", which agree to {known['error']:.0e}"
-    console.print(f"error: RMS of 7 scaled states over 1 s against exact Coulomb by {known['of']}{doubt}")
+    reference = report["reference"]
+    doubt = "" if reference["error"] is None else f", which agree to {reference['error']:.0e}"
+    console.print(f"error: RMS of 7 scaled states over 1 s against exact Coulomb by {reference['of']}{doubt}")
     for name, frame in (report["frame"] or {}).items():
         console.print(
             f"frame of 1 ms, {name}: median {frame['median_us']:.0f} us, 99.9 % {frame['p999_us']:.0f} us, "

@@ -74,9 +74,9 @@ def chart(
         echo(f"not installed: {missing} (pip install 'rotor-stator-rig[peers]'); left out of the chart", err=True)
     if outcome.outdated:
         echo(f"{outcome.outdated} points from an older version were measured again", err=True)
-    left = f", {outcome.left} not measured within the time limit: run again to add them" if outcome.left else ""
+    unmeasured = f", {outcome.left} not measured within the time limit: run again to add them" if outcome.left else ""
     counts = f"{outcome.measured} points measured, {outcome.resumed} kept, {outcome.failures} failures drawn"
-    echo(counts + left, err=True)
+    echo(counts + unmeasured, err=True)
     for path in outcome.files:
         echo(str(path))
     if outcome.interrupted:

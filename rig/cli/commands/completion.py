@@ -103,19 +103,19 @@ def complete(root: Group, shell: str, line: str) -> list[str]:
     if option is None and start.startswith("--") and equals:
         option, start, head = _options(command).get(name), value, name + "="
     if option is None and start.startswith("-"):
-        found = [(name, param.help or "") for name, param in _options(command).items() if name.startswith("--")]
+        candidates = [(name, param.help or "") for name, param in _options(command).items() if name.startswith("--")]
     elif option is None and isinstance(command, Group):
-        found = [each for commands in command.sections.values() for each in commands.items()]
+        candidates = [each for commands in command.sections.values() for each in commands.items()]
     else:
         arguments = [param for param in command.params if param.param_type_name == "argument"]
         if arguments and arguments[-1].nargs == -1:
             place = min(place, len(arguments) - 1)
         param = option or next(iter(arguments[place:]), None)
-        found = [] if param is None else list(_values(command, param, start))
+        candidates = [] if param is None else list(_values(command, param, start))
     # In a word with = or :, bash replaces only the part after the last one.
     cut = max(start.rfind("="), start.rfind(":")) + 1 if shell == "bash" else 0
     head = "" if shell == "bash" else head
-    fit = [each for each in found if not each[0] or each[0].startswith(start)]
+    fit = [each for each in candidates if not each[0] or each[0].startswith(start)]
     fit = [] if [word for word, _ in fit] == [start] != [""] else fit  # the word is complete
     return [f"{word and head + word[cut:]}\t{printable(says)}" for word, says in fit]
 

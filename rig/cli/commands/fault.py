@@ -35,7 +35,7 @@ _TEXTS = (
 
 def _options() -> dict[str, Any]:
     """Return the option of each parameter of the kinds of faults, by name."""
-    found, texts = dict[str, Any](), {each.partition(": ")[0]: each.partition(": ")[2] for each in _TEXTS}
+    options, texts = dict[str, Any](), {each.partition(": ")[0]: each.partition(": ")[2] for each in _TEXTS}
     for field in dict.fromkeys(field for kind in KINDS.values() for field in kind.model_fields if field != "kind"):
         own = {name: kind.model_fields[field] for name, kind in KINDS.items() if field in kind.model_fields}
         hint = next(iter(own.values())).annotation
@@ -45,8 +45,8 @@ def _options() -> dict[str, Any]:
         kinds = "all kinds of blocks" if field in BlockFault.model_fields else ", ".join(own)
         text = f"{texts.get(field, field)} ({kinds}{default})"
         option = _parameters(text, metavar="|".join(words) or ("CHANNEL" if hint is str else "X"))
-        found[field] = Annotated[str | None if words or hint is str else float | None, option]
-    return found
+        options[field] = Annotated[str | None if words or hint is str else float | None, option]
+    return options
 
 
 def fault(
@@ -65,7 +65,7 @@ def fault(
     **numbers: float | str | None,
 ) -> None:
     """Inject a fault into a channel of a running rig, or clear it; prints the first row that changes."""
-    given = {name: _plain(value) for name, value in numbers.items() if value is not None}
+    parameters = {name: _plain(value) for name, value in numbers.items() if value is not None}
     if listed:
         _show_kinds(channel, form)
         return
@@ -78,12 +78,12 @@ def fault(
     if kind not in KINDS:
         raise UnknownNameError("KIND", "one of `rig fault --list`", kind or "nothing", KINDS)
     try:
-        check_fault({"kind": kind, **given})
+        check_fault({"kind": kind, **parameters})
     except InputError as error:
         option = error.field.removeprefix(f"{kind}.").replace("_", "-")
         raise InputError(f"--{option} of {kind}", error.must, error.received) from None
     with connection.console("fault") as rig:
-        accepted = rig.fault(str(channel), kind, for_s=for_s, **given)
+        accepted = rig.fault(str(channel), kind, for_s=for_s, **parameters)
     show(accepted, "fault")
     rows = ", ".join(f"row {row} of {group}" for group, row in accepted.first_row.items())
     echo(
@@ -113,20 +113,18 @@ def _show_kinds(channel: str | None, form: Form) -> None:
     table = rig_table()
     rows = describe_kinds(table)
     if channel is not None:
-        known = [*table.channels, *table.groups, *KINDS]
-        if channel not in known:
-            raise UnknownNameError("CHANNEL", "a channel, a group or a kind of fault", channel, known)
+        targets = [*table.channels, *table.groups, *KINDS]
+        if channel not in targets:
+            raise UnknownNameError("CHANNEL", "a channel, a group or a kind of fault", channel, targets)
         names = {channel, *(table.groups[channel].names if channel in table.groups else ())}
-        kinds = {
-            kind for kind, each in KINDS.items() if any(list_refusals(each, table).get(name) == "" for name in names)
-        }
+        kinds = {key for key, kind in KINDS.items() if "" in map(list_refusals(kind, table).get, names)}
         rows = [row for row in rows if row[0] in {channel, *kinds}]
-    headings = ("kind", "stage", "what it does", "numbers", "on", "at")
+    headings = ("kind", "stage", "effect", "parameters", "channels", "transports")
     if form.as_json:
-        echo_json([dict(zip(headings, row, strict=True)) for row in rows])
+        words = ("kind", "stage", "what it does", "numbers", "on", "at")
+        echo_json([dict(zip(words, row, strict=True)) for row in rows])
         return
-    shown = ("kind", "stage", "effect", "parameters", "channels", "transports")
-    table_shown = new_table("", *shown, wrapped=("effect", "parameters"), spare=("transports", "channels", "stage"))
+    table_shown = new_table("", *headings, wrapped=("effect", "parameters"), spare=("transports", "channels", "stage"))
     for row in rows:
         table_shown.add_row(*row)
     form.console().print(table_shown)

@@ -82,26 +82,26 @@ class FitRequest:
 
         keys = [key for part in self.fit for key in split_names(part)]
         experiment, along = self._experiment(recording), dict[str, tuple[float, float] | None]()
-        known = parse_pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
-        priors = {key: _parse_pair("prior", text, "+-") for key, text in known.items()}
+        prior_texts = parse_pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
+        priors = {key: _parse_pair("prior", text, "+-") for key, text in prior_texts.items()}
         starts = {key: _number("start", text) for key, text in parse_pairs("--start", self.start, "KEY=VALUE").items()}
         limits = parse_pairs("--bounds", self.bounds, "KEY=LOW:HIGH")
         bounds = {key: _parse_pair("bounds", text, ":") for key, text in limits.items()}
-        given: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": split_names(self.channels) or None}
+        setup: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": split_names(self.channels) or None}
         if is_imported(recording) and not exact:
             if first_command_s(experiment) > 0.0:
                 search.check_unused(from_s=self.from_s)
                 rules = load_criteria().imported
-                found = identify_log(
-                    recording, experiment, keys, **given, priors=priors, to_s=self.to_s, bandwidth=rules.bandwidth,
+                identification = identify_log(
+                    recording, experiment, keys, **setup, priors=priors, to_s=self.to_s, bandwidth=rules.bandwidth,
                     variants=[variant.set for variant in rules.variants], progress=progress,
                 )  # fmt: skip
-                return found, [unknown.key for unknown in found.question.unknowns if unknown.nuisance]
+                return identification, [unknown.key for unknown in identification.question.unknowns if unknown.nuisance]
             experiment = fit_initial_state(recording, experiment)
             along = find_free_nuisances(experiment, keys)
             priors = {key: prior_value for key, prior_value in along.items() if prior_value is not None} | priors
         window = (self.from_s, self.to_s)
-        question = ask(recording, experiment, [*keys, *along], **given, priors=priors, nuisances=along, window=window)
+        question = ask(recording, experiment, [*keys, *along], **setup, priors=priors, nuisances=along, window=window)
         return identify_recording(question, **asdict(search), progress=progress), list(along)
 
     def _experiment(self, recording: Recording) -> Experiment:
@@ -138,9 +138,9 @@ class Search:
         """
         from rig.base.errors import InputError
 
-        given = {"--from": from_s, **{f"--{name}": value for name, value in asdict(self).items()}}
+        options = {"--from": from_s, **{f"--{name}": value for name, value in asdict(self).items()}}
         usual = {"--from": None, **{f"--{name}": value for name, value in asdict(Search()).items()}}
-        for option, value in given.items():
+        for option, value in options.items():
             if value != usual[option]:
                 raise InputError(
                     option, "left out for a log of another system, which is fitted from its hammer pulse", value
@@ -179,16 +179,16 @@ def identify(
     recording = join(files)
     name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
     with reporting(compiles=True) as reporter:
-        found, along = request.run(recording, search, exact=exact, progress=reporter.step)
-    fits = found.judgement.fits
+        identification, along = request.run(recording, search, exact=exact, progress=reporter.step)
+    fits = identification.judgement.fits
     if output is not None and fits:
-        write_set(format_set(found, recording=name), output)
+        write_set(format_set(identification, recording=name), output)
     if report is not None:
-        write_report(make_report(found, recording=name, origin=recording_origin(name, recording)), report)
+        write_report(make_report(identification, recording=name, origin=recording_origin(name, recording)), report)
     if form.as_json:
-        echo_json(identification_document(found, recording=name))
+        echo_json(identification_document(identification, recording=name))
     else:
-        _show(found, name, form.console())
+        _show(identification, name, form.console())
         _print_files(along, output if fits else None, report)
     if not fits:
         if output is not None:
@@ -223,25 +223,25 @@ def _parse_pair(option: str, text: str, between: str) -> tuple[float, float]:
     return _number(option, first), _number(option, second)
 
 
-def _show(found: Identification, name: str, console: Console) -> None:
+def _show(identification: Identification, name: str, console: Console) -> None:
     from replays.recordings.identification.summary import HEADINGS, cells, fit_line, spread_line, window_line
 
     numbers = ("start", "result", "95 % interval")
     headings = (f">{heading}" if heading in numbers else heading for heading in HEADINGS)
     table = new_table(f"{name}: fitted values", *headings, wrapped=HEADINGS[-1:])
-    for finding in found.judgement.findings:
+    for finding in identification.judgement.findings:
         table.add_row(*cells(finding), style="" if finding.standing == "identified" else "yellow")
     console.print(table)
-    positions = [place for place, unknown in enumerate(found.question.unknowns) if not unknown.nuisance]
-    keys = [found.question.keys[place] for place in positions]
+    positions = [place for place, unknown in enumerate(identification.question.unknowns) if not unknown.nuisance]
+    keys = [identification.question.keys[place] for place in positions]
     if len(keys) > 1:
         table = new_table("correlation", "", *(f">{key}" for key in keys))
-        for key, row in zip(keys, found.judgement.correlation[positions][:, positions], strict=True):
+        for key, row in zip(keys, identification.judgement.correlation[positions][:, positions], strict=True):
             table.add_row(key, *("-" if value != value else f"{value:+.4f}" for value in row))
         console.print()
         console.print(table)
     console.print()
-    console.print(window_line(found))
-    console.print(fit_line(found))
-    if found.narrowed:
-        console.print(spread_line(found))
+    console.print(window_line(identification))
+    console.print(fit_line(identification))
+    if identification.narrowed:
+        console.print(spread_line(identification))

@@ -151,7 +151,7 @@ def _find_questions(text: str) -> list[str]:
     """Return the questions of a mapping, each with its table."""
     from replays.recordings.formats.guessing.template import CHECK
 
-    found, table = [], ""
+    questions, table = [], ""
     for line in text.splitlines():
         if (bare := line.removeprefix("# ")).startswith("["):
             table = bare.partition("#")[0].strip()
@@ -159,8 +159,8 @@ def _find_questions(text: str) -> list[str]:
             held, _, question = line.partition(f"# {CHECK}: ")
             held = held.strip().removeprefix("# ")
             about = f"{table} {'' if held == table else held}".strip()
-            found.append(f"{about}: {question.partition(' (')[0]}")
-    return found
+            questions.append(f"{about}: {question.partition(' (')[0]}")
+    return questions
 
 
 _SPARK = 12

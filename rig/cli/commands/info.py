@@ -174,13 +174,13 @@ def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
     health = document["health"]
     doubtful = [channel["name"] for channel in health["channels"] if channel["findings"]]
     doubts = len(health["findings"]) + len(health["warnings"])
-    found = [f"doubts in {', '.join(doubtful)}"] if doubtful else []
-    found += [f"{doubts} {'doubt' if doubts == 1 else 'doubts'} about the recording"] if doubts else []
+    findings = [f"doubts in {', '.join(doubtful)}"] if doubtful else []
+    findings += [f"{doubts} {'doubt' if doubts == 1 else 'doubts'} about the recording"] if doubts else []
     return [
         ("verdict", outcome),
         ("lost", "; ".join(_lost_rows(document)) or "nothing"),
         *([("taken", f"{declared} rows removed or delayed by declared faults")] if declared else []),
-        ("health", "; ".join(found) or f"{len(health['channels'])} channels without doubts"),
+        ("health", "; ".join(findings) or f"{len(health['channels'])} channels without doubts"),
     ]
 
 
@@ -243,13 +243,13 @@ def _streams_table(streams: dict[str, dict[str, Any]]) -> Table:
 def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Table:
     from rig.base.wire import sensor_key
 
-    found = {channel["name"]: channel for channel in (health or {}).get("channels", [])}
-    seen_of = (">mean", ">low", ">high", ">noise", ">calibrated", "health") if found else ()
+    statistics = {channel["name"]: channel for channel in (health or {}).get("channels", [])}
+    statistics_columns = (">mean", ">low", ">high", ">noise", ">calibrated", "health") if statistics else ()
     table = new_table(
         "",
-        *("channel", "unit", *seen_of, "range", ">step", ">rate [Hz]", "label"),
+        *("channel", "unit", *statistics_columns, "range", ">step", ">rate [Hz]", "label"),
         wrapped=("health", "label"),
-        spare=("label", "rate [Hz]", "step", "range", "calibrated") if found else (),
+        spare=("label", "rate [Hz]", "step", "range", "calibrated") if statistics else (),
     )
     for group in recording.table.groups.values():
         if sensor_key(group.name) not in recording.messages:
@@ -257,7 +257,7 @@ def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Tabl
         for channel in group.channels:
             ends = sorted((volts - channel.bias_v) / channel.sensitivity_v for volts in channel.range_v)
             reach = f"{ends[0]:.4g} to {ends[1]:.4g}" if channel.has_range else "not known"
-            entry = found.get(make_printable(channel.name), {})
+            entry = statistics.get(make_printable(channel.name), {})
             numbers = [
                 _number(entry.get(name), entry.get("noise") or channel.scale) for name in ("mean", "low", "high")
             ]
@@ -265,7 +265,7 @@ def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Tabl
             findings = entry.get("findings", [])
             verdict = "; ".join(findings) or ("good" if entry else "")
             table.add_row(
-                *(channel.name, channel.unit, *((*numbers, *noise, verdict) if found else ())),
+                *(channel.name, channel.unit, *((*numbers, *noise, verdict) if statistics else ())),
                 *(reach, f"{abs(channel.scale):.2g}", f"{group.rate_hz}", channel.label),
                 style="yellow" if findings else "",
             )

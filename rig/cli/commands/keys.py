@@ -64,14 +64,14 @@ def _parts(page: str) -> Iterator[Table | Text | str]:
 
 def _document(page: str) -> dict[str, list[dict[str, Any]]]:
     """Return the rows of the page's tables by table title; a row maps headings to cells."""
-    found, title = {}, ""
+    rows_by_title, title = {}, ""
     for part in _parts(page):
         if isinstance(part, Table):
             columns = [_values([cells[at].plain for cells, _ in part.rows]) for at in range(len(part.headings))]
-            found[title] = [dict(zip(part.headings, row, strict=True)) for row in zip(*columns, strict=True)]
+            rows_by_title[title] = [dict(zip(part.headings, row, strict=True)) for row in zip(*columns, strict=True)]
         elif not isinstance(part, str):
             title = part.plain.replace("`", "").partition(":")[0]
-    return found
+    return rows_by_title
 
 
 def _values(texts: list[str]) -> list[Any]:

@@ -61,7 +61,7 @@ def ladder(
     if write is not None:
         check_target(write, scene, loaded)
     with reporting(compiles=True) as reporter:
-        found = search(
+        result = search(
             loaded,
             tolerances,
             keep=tuple(keep or ()),
@@ -69,15 +69,15 @@ def ladder(
             budget_s=budget_s,
             progress=reporter.step,
         )
-    document = ladder_document(found)
+    document = ladder_document(result)
     paths: list[Path] = []
     if output is not None:
-        paths = draw(found, output)
+        paths = draw(result, output)
         paths.append(output / "ladder.json")
         with whole_file(paths[-1]) as draft:
             draft.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     if write is not None:
-        write_pick(write, scene, make_pick(found))
+        write_pick(write, scene, make_pick(result))
     if form.as_json:
         echo_json(document)
         return
@@ -105,8 +105,8 @@ def _show(document: dict[str, Any], console: Console) -> None:
     own = ", ".join(f"{entry['as_given_error']:.1e}" if entry["as_given_error"] is not None else "infinite"
                     for entry in document["quantities"])  # fmt: skip
     saved = ", ".join(f"{level} {pick[level]} saves {part:.0%}" for level, part in document["savings"].items())
-    picked, given = document["picked"], document["given"]
-    same = (picked["engine"], picked["model"]) == (given["engine"], given["model"])
+    picked, scene = document["picked"], document["given"]
+    same = (picked["engine"], picked["model"]) == (scene["engine"], scene["model"])
     none = "the scene unchanged" if same else "no simplification"
     echo(f"  {saved or none}; outcome {picked['outcome']} as in the full model")
     echo(
@@ -116,7 +116,7 @@ def _show(document: dict[str, Any], console: Console) -> None:
     )
     if pick["sensors"] == "ideal":
         echo("  sensors ideal: these quantities do not depend on the sensors; --keep sensors keeps the chain")
-    if given["engine"].endswith("companion") and not pick["companion"]:
+    if scene["engine"].endswith("companion") and not pick["companion"]:
         echo("  no companion: a run does not estimate its error; the errors above were measured here")
     echo(
         f"  reference: full model by {document['reference']['engine']}, its error estimated from "

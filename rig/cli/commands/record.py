@@ -101,12 +101,12 @@ class Triggers:
             "again": None if self.again is None else RetriggerAction(self.again).value,
             "longest_s": self.longest_s,
         }
-        given = {name: value for name, value in around.items() if value is not None}
+        options = {name: value for name, value in around.items() if value is not None}
         triggers = tuple(Trigger.parse(text) for text in self.trigger or ())
-        if given and not triggers:
-            name, value = next(iter(given.items()))
+        if options and not triggers:
+            name, value = next(iter(options.items()))
             raise InputError("trigger_count" if name == "count" else name, "used with --trigger", value)
-        settings: dict[str, Any] = {"pre_s": _PRE_S, "post_s": _POST_S, **given}
+        settings: dict[str, Any] = {"pre_s": _PRE_S, "post_s": _POST_S, **options}
         return Capture(triggers, **settings) if triggers else None
 
 

@@ -28,15 +28,15 @@ def scene_command(name: str) -> Callable[..., None]:
         quantity, unit = each.quantity, each.quantity.unit.replace(" ", "")
         shown = {"metavar": each.quantity.metavar, "help": each.quantity.help}
         if each.required:
-            given: Any = typer.Argument(**{**shown, "metavar": quantity.metavar or unit.upper()})
+            parameter: Any = typer.Argument(**{**shown, "metavar": quantity.metavar or unit.upper()})
         else:
-            given = typer.Option(**shown)
-        hints[field] = Annotated[str if each.takes_text else float, given]
+            parameter = typer.Option(**shown)
+        hints[field] = Annotated[str if each.takes_text else float, parameter]
         default = inspect.Parameter.empty if each.required else each.default
         parameters.append(inspect.Parameter(field, inspect.Parameter.KEYWORD_ONLY, default=default))
 
-    def command(*, connection: Connection, **given: Any) -> None:
-        values = {field: as_number(value) if isinstance(value, str) else value for field, value in given.items()}
+    def command(*, connection: Connection, **arguments: Any) -> None:
+        values = {field: as_number(value) if isinstance(value, str) else value for field, value in arguments.items()}
         value_texts = [f"{values[field]:g} {each.quantity.unit}" for field, each in fields.items() if each.required]
         with connection.console(name) as rig:
             show(rig.send(name, **values), " ".join([name, *value_texts]))

@@ -151,13 +151,13 @@ def _judge_live(
     stopped = threading.Event()
     with tempfile.TemporaryDirectory(prefix="rig-score-") as folder:
         with connection.client() as client, reporting() as reporter, stop_on_signals(stopped.set):
-            found = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, report=reporter.part)
+            collected = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, report=reporter.part)
         card = judge(
-            found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals, channels=channels,
-            mapping=mapping,
+            collected.file, [collected.session], limits=limits, path=path, arrivals=collected.arrivals,
+            channels=channels, mapping=mapping,
         )  # fmt: skip
     card.title = f"standard input, compared with the rig at {connection.connect}"
-    card.remarks[:0] = found.remarks
+    card.remarks[:0] = collected.remarks
     return card
 
 

@@ -120,25 +120,25 @@ def _sweep(count: int, seed: int, only: str | None, engines: list[str], folder: 
                 reporter.step(f"scene {row['number']}: {row['status']}")
         except KeyboardInterrupt:
             interrupted = True
-    found = summary(rows, engines)
+    result = summary(rows, engines)
     pictures: list[Path] = []
-    if folder is not None and found["scenes"]["decided"]:
+    if folder is not None and result["scenes"]["decided"]:
         from replays.studies.stability.scenes.sweep_figure import draw_sweep
 
         pictures = draw_sweep(folder, rows, engines)
     if form.as_json:
-        echo_json({"seed": seed, **found, "pictures": [str(path) for path in pictures]})
+        echo_json({"seed": seed, **result, "pictures": [str(path) for path in pictures]})
     else:
         console = form.console()
-        console.print(sweep_table(found, seed))
-        for line in _sweep_lines(found):
+        console.print(sweep_table(result, seed))
+        for line in _sweep_lines(result):
             echo(line)
         for path in pictures:
             echo(f"picture  {path}")
     if interrupted:
         echo("stopped; run the same command with the same -o FOLDER to continue", err=True)
         raise typer.Exit(130)
-    own = found["engines"][engines[0]]
+    own = result["engines"][engines[0]]
     if any(own[kind] for kind in ("silent", "crashes", "hangs", "absurd")):
         raise typer.Exit(1)
 
@@ -153,55 +153,55 @@ def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, fo
         select_scenes,
     )
 
-    names, found, interrupted = select_scenes(only), list[SceneOutcome](), False
+    names, runs, interrupted = select_scenes(only), list[SceneOutcome](), False
     if folder is not None:
         prepare_folder(folder)
     with reporting(compiles=True) as reporter:
         try:
             for outcome in outcomes(names, engines, peers=engines is None):
-                found.append(outcome)
+                runs.append(outcome)
                 reporter.step(f"{outcome.scene}, {outcome.method} {outcome.setting}: {outcome.kind}")
         except KeyboardInterrupt:
             interrupted = True
-    pictures = [] if folder is None or interrupted else draw_scene_atlas(folder, found)
+    pictures = [] if folder is None or interrupted else draw_scene_atlas(folder, runs)
     if form.as_json:
-        echo_json({"outcomes": [outcome.document() for outcome in found], "pictures": [str(path) for path in pictures]})
+        echo_json({"outcomes": [outcome.document() for outcome in runs], "pictures": [str(path) for path in pictures]})
     else:
-        form.console().print(scenes_table(found))
+        form.console().print(scenes_table(runs))
         for path in pictures:
             echo(f"picture  {path}")
     if interrupted:
         echo("stopped; only the runs shown were measured, and no picture was drawn", err=True)
         raise typer.Exit(130)
-    if any(is_silent(outcome) for outcome in found if outcome.method == found[0].method):
+    if any(is_silent(outcome) for outcome in runs if outcome.method == runs[0].method):
         raise typer.Exit(1)
 
 
-def scenes_table(found: list[SceneOutcome]) -> Table:
+def scenes_table(outcomes: list[SceneOutcome]) -> Table:
     """Return a table of how often each method had each outcome."""
     from replays.studies.stability.scenes.scene_atlas import OUTCOMES
 
-    scenes = len({outcome.scene for outcome in found})
+    scenes = len({outcome.scene for outcome in outcomes})
     table = new_table(
         f"{scenes} scenes, each method at its settings: number of runs", "method", *(f">{k}" for k in OUTCOMES)
     )
-    for method in dict.fromkeys(outcome.method for outcome in found):
-        kinds = [outcome.kind for outcome in found if outcome.method == method]
+    for method in dict.fromkeys(outcome.method for outcome in outcomes):
+        kinds = [outcome.kind for outcome in outcomes if outcome.method == method]
         table.add_row(method, *(str(kinds.count(kind) or "-") for kind in OUTCOMES))
     return table
 
 
-def sweep_table(found: dict[str, Any], seed: int) -> Table:
+def sweep_table(sweep: dict[str, Any], seed: int) -> Table:
     """Return a table of each engine's results in random scenes."""
     from replays.studies.stability.scenes.sweep import QUANTILES
 
-    scenes = found["scenes"]
+    scenes = sweep["scenes"]
     table = new_table(
         f"random scenes of seed {seed}: " + ", ".join(f"{number} {status}" for status, number in scenes.items()),
         "engine", ">told", *(f">{share:.0%}" for share in QUANTILES), ">within", ">silent", ">false", ">crash", ">hang",
         ">absurd", ">slowest", ">median",
     )  # fmt: skip
-    for name, result in found["engines"].items():
+    for name, result in sweep["engines"].items():
         errors = [f"{error:.0e}" for error in result["error"] or []] or ["-"] * len(QUANTILES)
         within = "-" if result["within"] is None else f"{result['within']:.0%}"
         faults = [str(len(result[kind])) for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd")]
@@ -210,7 +210,7 @@ def sweep_table(found: dict[str, Any], seed: int) -> Table:
     return table
 
 
-def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
+def _sweep_lines(sweep: dict[str, Any]) -> Iterator[str]:
     """Yield the explanations of the table's columns, and the numbers of the affected scenes."""
     yield (
         "\nQuantiles of the scaled error in decided scenes; within: share of non-chaotic scenes with an error "
@@ -218,14 +218,14 @@ def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
         "within; speeds: simulated s over processor s. Untold: scenes that fewer than two accurate engines accept; "
         "unbounded: scenes in which the model gains energy without limit; faults there do not count."
     )
-    for name, result in found["engines"].items():
+    for name, result in sweep["engines"].items():
         for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd"):
             if result[kind]:
                 yield f"{name}, {kind.replace('_', ' ')}: scenes {', '.join(map(str, result[kind]))}"
         for reason, number in result["refused"].items():
             if "accurate" not in name:
                 yield f"{name} refuses {number}: {reason}"
-    for scene in found["undecided"]:
+    for scene in sweep["undecided"]:
         odd = f", {scene['odd']} alone" if scene["odd"] else ""
         yield (
             f"undecided: scene {scene['number']}, accurate runs differ by {scene['distance']:.1e}{odd}; "
@@ -259,11 +259,11 @@ def trials_table(cells: list[Cell], names: list[str]) -> Table:
     table = new_table("trials by engine: measured", "trial", "case", *(f">{name}" for name in names), keys=2)
     previous_trial = ""
     for trial, case in dict.fromkeys((cell.trial, cell.case) for cell in cells):
-        found = {cell.method: cell for cell in cells if (cell.trial, cell.case) == (trial, case)}
+        cells_by_method = {cell.method: cell for cell in cells if (cell.trial, cell.case) == (trial, case)}
         if trial != previous_trial:
             table.add_row(Text(f"{trial}: {TRIALS[trial].title}", "bold"))
             previous_trial = trial
-        table.add_row(trial, case, *(_text(found.get(name)) for name in names))
+        table.add_row(trial, case, *(_text(cells_by_method.get(name)) for name in names))
     return table
 
 

@@ -55,65 +55,65 @@ def validate(
     if report is not None:
         check_report(report, force=force)
     rules = load_criteria(criteria)
-    given = SceneChanges(changes=changes, engine=engine).overrides()
-    overrides = {key: read_value(value) for key, value in given.items()}
+    texts = SceneChanges(changes=changes, engine=engine).overrides()
+    overrides = {key: read_value(value) for key, value in texts.items()}
     recording = join(files)
     with reporting(compiles=True) as reporter:
-        found = hold(recording, criteria=rules, changes=overrides, declared=declared, blind=blind, step=reporter.step)
+        result = hold(recording, criteria=rules, changes=overrides, declared=declared, blind=blind, step=reporter.step)
         if report is not None:
             from replays.recordings.validation.report import make_report
 
             reporter.step("report")
-            write_report(make_report(found, origin=recording_origin(found.title, recording)), report)
+            write_report(make_report(result, origin=recording_origin(result.title, recording)), report)
     if form.as_json:
-        echo_json(found.document())
+        echo_json(result.document())
     else:
-        _show(found, form.console())
+        _show(result, form.console())
         if report is not None:
             echo(f"report  {report}")
-    if found.outcome.exit_status:
-        raise typer.Exit(found.outcome.exit_status)
+    if result.outcome.exit_status:
+        raise typer.Exit(result.outcome.exit_status)
 
 
-def _show(found: Validation, console: Console) -> None:
-    changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
+def _show(result: Validation, console: Console) -> None:
+    changed = ", ".join(f"{key} = {value}" for key, value in result.changes.items())
     console.print(
-        make_printable(f"{found.title}, scene {found.scene}") + (f", validated with {changed}" if changed else "")
+        make_printable(f"{result.title}, scene {result.scene}") + (f", validated with {changed}" if changed else "")
     )
-    console.print(found.verdict_line)
-    for line in found.doubts[1:]:
+    console.print(result.verdict_line)
+    for line in result.doubts[1:]:
         console.print(f"also: {line}")
-    if found.explained is not None:
-        console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")
-    for fault in found.faults:
-        if found.explained is None or fault.line not in found.explained.conclusion:
+    if result.explained is not None:
+        console.print(f"first difference at {result.explained.from_s:.4f} s; {result.explained.conclusion}")
+    for fault in result.faults:
+        if result.explained is None or fault.line not in result.explained.conclusion:
             console.print(make_printable(f"signal: {fault.line}"))
-    console.print(found.bits_line)
-    for item in found.fitted:
+    console.print(result.bits_line)
+    for item in result.fitted:
         console.print(item.line)
-    if found.calibration:
-        console.print(f"calibration: {found.calibration_line}")
-    if found.bit_exact and not found.declared:
+    if result.calibration:
+        console.print(f"calibration: {result.calibration_line}")
+    if result.bit_exact and not result.declared:
         return
-    if found.explained is not None and any(_counts(item) for item in found.explained.ranked):
+    if result.explained is not None and any(_counts(item) for item in result.explained.ranked):
         console.print()
-        console.print(_explanations(found.explained))
+        console.print(_explanations(result.explained))
         console.print("left: RMS of the remaining residual over the noise; 1 is noise alone")
-    begin, end = found.window_s
-    console.print(f"\ntrajectory from {begin:.4f} to {end:.4f} s: {found.window_reason}\n")
-    console.print(_trajectory(found))
+    begin, end = result.window_s
+    console.print(f"\ntrajectory from {begin:.4f} to {end:.4f} s: {result.window_reason}\n")
+    console.print(_trajectory(result))
     console.print()
-    if found.truth:
-        console.print(_truth(found))
+    if result.truth:
+        console.print(_truth(result))
         console.print()
-    if found.statistics:
-        console.print(_statistics(found))
+    if result.statistics:
+        console.print(_statistics(result))
 
 
-def _trajectory(found: Validation) -> Table:
+def _trajectory(validation: Validation) -> Table:
     headings = ("channel", ">noise", ">RMS", ">limit", ">largest", ">drift", ">first at", "verdict")
     table = new_table("Trajectory: residual over the channel's own noise", *headings)
-    for item in found.residuals:
+    for item in validation.residuals:
         table.add_row(
             item.channel,
             f"{item.floor:.3g} {item.unit}".rstrip(),
@@ -127,17 +127,17 @@ def _trajectory(found: Validation) -> Table:
     return table
 
 
-def _truth(found: Validation) -> Table:
+def _truth(validation: Validation) -> Table:
     headings = ("table", "column with largest error", ">error", ">limit", "verdict")
     table = new_table("Truth: largest difference as a part of the column's largest value", *headings)
-    for item in found.truth:
+    for item in validation.truth:
         table.add_row(item.table, item.column, f"{item.relative:.1e}", f"{item.limit:.1e}", _VERDICTS[item.good])
     return table
 
 
-def _statistics(found: Validation) -> Table:
+def _statistics(validation: Validation) -> Table:
     table = new_table("Phases", "phase", "quantity", ">recorded", ">predicted", ">limit", "verdict")
-    for item in found.statistics:
+    for item in validation.statistics:
         limit = "" if item.limit is None else f"± {item.limit:.2g}"
         table.add_row(
             item.phase, item.title, f"{item.recorded:.6g}", f"{item.foretold:.6g}", limit, _VERDICTS[item.good]
@@ -154,7 +154,7 @@ def _explanations(explained: Explained) -> Table:
     title = "Candidate explanations of the difference, each alone"
     table = new_table(title, *headings, wrapped=["change"], spare=("kind", "fitted to"))
     for one in [one for one in explained.ranked if _counts(one)][:12]:
-        told = "named" if one.name in explained.best else ""
-        row = (one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s", told)
+        verdict = "named" if one.name in explained.best else ""
+        row = (one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s", verdict)
         table.add_row(*row)
     return table

@@ -59,10 +59,10 @@ class CanOutlets:
 
     def lines(self) -> list[str]:
         """Return the address of each outlet in a line."""
-        found = [f"CAN {name} as an SLCAN adapter on {port.path}" for name, port in self._ports.items()]
+        lines = [f"CAN {name} as an SLCAN adapter on {port.path}" for name, port in self._ports.items()]
         if self._server is not None:
-            found.append(f"CAN by socketcand on {self._server.host}:{self._server.port}, classic frames only")
-        return found
+            lines.append(f"CAN by socketcand on {self._server.host}:{self._server.port}, classic frames only")
+        return lines
 
     def warnings(self) -> list[str]:
         """Return the current warnings."""
@@ -76,11 +76,11 @@ class CanOutlets:
 
     def summary(self) -> list[str]:
         """Return the counters of each outlet in a line."""
-        found = {f"slcan {port.path}": port.figures() for port in self._ports.values()}
+        counters = {f"slcan {port.path}": port.figures() for port in self._ports.values()}
         if self._server is not None:
-            found["socketcand"] = self._server.counts()
+            counters["socketcand"] = self._server.counts()
         return [
             "  ".join([name, *(f"{what.replace('_', ' ')} {count}" for what, count in counts.items() if count)])
-            for name, counts in found.items()
+            for name, counts in counters.items()
             if any(counts.values())
         ]

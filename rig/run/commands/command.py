@@ -135,14 +135,14 @@ class SceneCommand(Written):
     @classmethod
     def quantities(cls) -> dict[str, CommandField]:
         """Return the fields that have a unit, by name, with their limits."""
-        found = {}
+        quantities = {}
         for name, info in cls.model_fields.items():
             if (quantity := next((entry for entry in info.metadata if isinstance(entry, Quantity)), None)) is not None:
                 ends = [[getattr(entry, end) for entry in info.metadata if hasattr(entry, end)] for end in ("ge", "le")]
                 low, high = (own[0] if own else edge for own, edge in zip(ends, quantity.span, strict=True))
                 takes_text = info.annotation is not float
-                found[name] = CommandField(quantity, low, high, info.default, info.is_required(), takes_text)
-        return found
+                quantities[name] = CommandField(quantity, low, high, info.default, info.is_required(), takes_text)
+        return quantities
 
     def request(self) -> dict[str, Any]:
         """Return the fields as a client sends them."""
@@ -198,8 +198,8 @@ class SceneCommand(Written):
 
 def find_commands(module: ModuleType) -> dict[str, type[SceneCommand]]:
     """Return the command classes of a module by name."""
-    found = {name: vars(module).get(f"{name.capitalize()}Command") for name in SUMMARIES}
-    return {name: entry for name, entry in found.items() if entry is not None}
+    classes = {name: vars(module).get(f"{name.capitalize()}Command") for name in SUMMARIES}
+    return {name: entry for name, entry in classes.items() if entry is not None}
 
 
 def as_number(text: str) -> str | float:

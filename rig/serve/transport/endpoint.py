@@ -91,7 +91,7 @@ def read_backlogs(port: int) -> dict[int, int]:
 
     Counts bytes that our socket has not sent and, if the other side is on this computer, those that it has not read.
     """
-    found: dict[int, int] = {}
+    backlogs: dict[int, int] = {}
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         with contextlib.suppress(OSError):
             for row in Path(table).read_text().splitlines()[1:]:
@@ -101,10 +101,10 @@ def read_backlogs(port: int) -> dict[int, int]:
                 local, remote = (int(fields[column].rpartition(":")[2], 16) for column in (1, 2))
                 unsent, unread = (int(part, 16) for part in fields[4].split(":"))
                 if local == port:
-                    found[remote] = found.get(remote, 0) + unsent
+                    backlogs[remote] = backlogs.get(remote, 0) + unsent
                 elif remote == port:
-                    found[local] = found.get(local, 0) + unread
-    return found
+                    backlogs[local] = backlogs.get(local, 0) + unread
+    return backlogs
 
 
 def close_links(port: int, peers: set[int]) -> None:

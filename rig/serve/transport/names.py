@@ -109,13 +109,13 @@ def resolve_endpoint(text: str, *, field: str, wait_s: float = 0.0) -> tuple[str
     text = text.removeprefix("zenoh:")
     if ":" in text:
         return parse_endpoint(text, field=field)
-    found = {}
+    rigs = {}
     for _ in Deadline(wait_s).polls(_POLL_S):
-        found = {entry.name: entry.endpoint for entry in list_running()} if _NAME.fullmatch(text) else {}
-        if text in found:
-            return parse_endpoint(found[text], field=field)
+        rigs = {entry.name: entry.endpoint for entry in list_running()} if _NAME.fullmatch(text) else {}
+        if text in rigs:
+            return parse_endpoint(rigs[text], field=field)
     must = f"HOST:PORT such as {DEFAULT_ENDPOINT}, or the name of a running rig"
-    raise (UnknownNameError(field, must, text, found) if found else InputError(field, f"{must} (none runs)", text))
+    raise (UnknownNameError(field, must, text, rigs) if rigs else InputError(field, f"{must} (none runs)", text))
 
 
 def parse_url(url: str) -> str:
@@ -142,8 +142,8 @@ def _folder() -> Path:
     folder = runtime / "rig" if runtime.is_dir() else Path(tempfile.gettempdir()) / f"rig-{os.getuid()}"
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise InputError("names", f"kept in a folder private to its owner (chmod 700 {folder})", Words("another"))
     return folder
 

@@ -126,28 +126,28 @@ class Recovery:
         """Deliver missing messages up to a number from the cache; report and give up those that it no longer has."""
         last = self._last.get(publisher)
         # Messages sent before the first known one are history; those no longer in the cache are not a loss.
-        known = last is not None
+        has_first = last is not None
         missing = 0
         first = 0 if last is None else last + 1
         oldest = max(first, last_number + 1 - self._cache)
-        if known:
+        if has_first:
             missing += oldest - first
         first = oldest
         while first <= last_number:
             end = min(last_number, first + _BATCH - 1)
-            found = self._fetch(key, publisher, first, end)
-            if found is None:
+            samples = self._fetch(key, publisher, first, end)
+            if samples is None:
                 break
-            for number in sorted(found):
-                if known:
+            for number in sorted(samples):
+                if has_first:
                     missing += number - first
-                known = True
+                has_first = True
                 first = number + 1
-                self._deliver(publisher, number, found[number])
-            if known:
+                self._deliver(publisher, number, samples[number])
+            if has_first:
                 missing += end + 1 - first
             first = end + 1
-        if known:
+        if has_first:
             missing += max(0, last_number + 1 - first)
         self._last[publisher] = last_number
         if missing and self._on_miss is not None:
@@ -155,24 +155,24 @@ class Recovery:
 
     def _fetch(self, key: str, publisher: Publisher, first: int, end: int) -> dict[int, Any] | None:
         """Return the samples of a range that a cache has, by number; None if the cache does not answer."""
-        found: dict[int, Any] = {}
+        samples: dict[int, Any] = {}
         for attempt in range(_ATTEMPTS):
             if attempt:
                 # The link may have been lost, and return soon.
                 self._pause(_RETRY_S)
             for reply in self._query_cache(key, publisher, f"_sn={first}..{end}"):
                 if first <= (number := reply.source_info.source_sn) <= end:
-                    found[number] = reply
-            if end in found:
+                    samples[number] = reply
+            if end in samples:
                 # Replies come in order: those missing before this one are no longer in the cache.
-                return found
+                return samples
             # An empty reply may be a lost one. Only the newest number shows that these are no longer in the cache.
             newest = max(
                 (reply.source_info.source_sn for reply in self._query_cache(key, publisher, "_max=1")), default=end
             )
             if newest - end >= self._cache:
-                return found
-        return found or None
+                return samples
+        return samples or None
 
     def _deliver(self, publisher: Publisher, number: int, sample: Any) -> None:
         self._last[publisher] = number

@@ -284,9 +284,9 @@ class ZenohClient(Closing):
 
     def _linked_rigs(self) -> set[str]:
         # A client does not listen, so its only peer is the rig that it connected to.
-        found = set(map(str, self._session.session.info.peers_zid()))
-        self._rigs |= found
-        return found
+        rigs = set(map(str, self._session.session.info.peers_zid()))
+        self._rigs |= rigs
+        return rigs
 
     def _is_linked_rig(self, publisher: str | None) -> bool:
         """Return whether a message is from the rig, by its publisher; others are counted and ignored."""

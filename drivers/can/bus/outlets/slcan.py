@@ -223,20 +223,20 @@ class SlcanPort(Outlet):
         """Return whether a command requests the rate of the bus."""
         speed = self._speed
         if command == "S" and re.fullmatch(r"[0-8]", rest):
-            requested, given = _RATES[int(rest)], None if speed is None else speed.nominal_bit_s
+            requested, bus_rate = _RATES[int(rest)], None if speed is None else speed.nominal_bit_s
         elif command == "Y" and re.fullmatch(r"[1-9]", rest):
             if speed is not None and not speed.fd:
                 return False
-            requested, given = 1e6 * int(rest), None if speed is None else speed.data_bit_s
+            requested, bus_rate = 1e6 * int(rest), None if speed is None else speed.data_bit_s
         elif command == "s" and re.fullmatch(r"[0-9A-Fa-f]{4}", rest):
             # Bus timing registers 0 and 1 of the SJA1000.
             first, second = bytes.fromhex(rest)
             quanta = 1 + (second & 15) + 1 + (second >> 4 & 7) + 1
             requested = _CLOCK_HZ / (((first & 63) + 1) * quanta)
-            given = None if speed is None else speed.nominal_bit_s
+            bus_rate = None if speed is None else speed.nominal_bit_s
         else:
             return False
-        return given is None or abs(requested - given) < 1e-3 * given
+        return bus_rate is None or abs(requested - bus_rate) < 1e-3 * bus_rate
 
     def _transmit(self, line: str) -> bytes | None:
         import can

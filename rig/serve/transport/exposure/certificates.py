@@ -150,8 +150,8 @@ def create_keys(
     if unknown := sorted(set(truth) - set(ROLES)):
         raise InputError("--truth", f"one of {', '.join(ROLES)}", unknown[0])
     if folder.exists() or folder.is_symlink():
-        found = {path.relative_to(folder) for path in folder.rglob("*")} if folder.is_dir() else {None}
-        if found and not (force and found <= _LAYOUT):
+        existing = {path.relative_to(folder) for path in folder.rglob("*")} if folder.is_dir() else {None}
+        if existing and not (force and existing <= _LAYOUT):
             must = "a new folder (--force replaces one that holds nothing but keys of a rig)"
             raise InputError("DIR", must, Words(f"{folder}, which exists"))
     try:
