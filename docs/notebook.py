@@ -15,13 +15,13 @@ faster = {"drive.profile": [[0.0, 1.0], [9.0, 10.0]], "duration_s": 9.0, "sensor
 hammer = rig.simulate("hammer", {"drive.speed_hz": 6.2, "duration_s": 1.0})
 run_up = rig.simulate("run-up", faster)
 
-# %% The same of recordings: of the hammer at another speed, and of a run-up that is recorded here, with more unbalance
+# %% The same from recordings: the hammer at another speed, and a run-up with more unbalance, recorded here
 heavier = rig.load_scene("run-up", faster | {"shaft.unbalance_eccentricity": 0.2})
 write_run(rig.Simulation(heavier), Path("run-up.mcap"), force=True)
 with Recording.open("replays/sessions/hammer-5.2.mcap") as impact, Recording.open("run-up.mcap") as run:
     recorded = [(impact.samples("probes"), impact.edges()), (run.samples("probes"), run.edges())]
 
-# %% A row each: orbit; full spectrum, where a whirl against the spin is on the left; once-per-turn amplitude and phase
+# %% One row each: orbit; full spectrum (backward whirl on the left); amplitude and phase at 1X
 figure, axes = plt.subplots(2, 4, figsize=(16, 7), layout="constrained")
 simulated = [(hammer.samples, hammer.edges_s), (run_up.samples, run_up.edges_s)]
 for row, title, ((s, _), (r, edges_s)) in zip(axes, ("simulated", "recorded"), (simulated, recorded), strict=True):

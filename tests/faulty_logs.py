@@ -16,7 +16,7 @@ from tests.second_rig import NOISE, Motion
 
 Values = dict[str, np.ndarray]
 PROBES, FORCES = ("disk_x", "disk_y", "ring_x", "ring_y"), ("P_N", "P_S", "P_E", "P_W")
-HOUSES = ("inner_x", "inner_y", "outer_x", "outer_y")
+HOUSINGS = ("inner_x", "inner_y", "outer_x", "outer_y")
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ CASES = tuple(
        for degrees in (2, 10, 45)]
     + [Case("disk as inch for mm", r"gain .*as inch for mm", analog=_gain(PROBES[:2], 1.0 / 25.4)),
        Case("forces as lbf for N", r"gain .*as lbf for N", analog=_gain(FORCES, 1.0 / 4.4482)),
-       Case("houses as g for m/s^2", r"gain .*as g for m/s\^2", analog=_gain(HOUSES, 1.0 / 9.80665))]
+       Case("housings as g for m/s^2", r"gain .*as g for m/s\^2", analog=_gain(HOUSINGS, 1.0 / 9.80665))]
     + [Case(f"clock {ppm:+g} ppm", r"clock: [-+]", ppm=ppm) for ppm in (600.0, 2000.0, -5000.0)]
     + [Case("P_N stuck for 10 ms", "P_N freeze", digital=_held("P_N", 0.9, 0.01)),
        Case("P_N stuck for 50 ms", "P_N freeze", digital=_held("P_N", 0.9, 0.05)),

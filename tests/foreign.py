@@ -132,8 +132,9 @@ def write_tdms(path: Path, *, rate_hz: float = 25_600.0) -> dict[str, tuple[floa
     about = {"unit_string": "V", "wf_increment": 1.0 / rate_hz, "wf_start_time": began}
     for channel, (name, per_unit_v, unit, size, bias_v) in VOLTS.items():
         kept[channel] = (rate_hz, bias_v + per_unit_v * signals[channel])
-        told = {"sensitivity": size, "sensitivity_unit": unit, **({"bias": bias_v, "bias_unit": "V"} if bias_v else {})}
-        objects.append(ChannelObject("AI", name, kept[channel][1], {**about, **told}))
+        bias = {"bias": bias_v, "bias_unit": "V"} if bias_v else {}
+        scale = {"sensitivity": size, "sensitivity_unit": unit, **bias}
+        objects.append(ChannelObject("AI", name, kept[channel][1], {**about, **scale}))
     kept["keyphasor"] = (rate_hz, 5.0 * signals["keyphasor"])
     objects.append(ChannelObject("AI", "tacho", kept["keyphasor"][1], about))
     with TdmsWriter(path) as writer:

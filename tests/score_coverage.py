@@ -118,11 +118,11 @@ NOISES: dict[str, Callable[[np.random.Generator, int], Noise]] = {
 
 
 @lru_cache
-def _curve(seed: int, **told: Any) -> Callable[[np.ndarray], np.ndarray]:
+def _curve(seed: int, **settings: Any) -> Callable[[np.ndarray], np.ndarray]:
     """Return a spline through tones at 5 times the rate: 30 times as fast, and used as the known signal itself."""
     from scipy.interpolate import make_interp_spline
 
-    signal = Tones(seed, 1.0, **told)
+    signal = Tones(seed, 1.0, **settings)
     grid_s = np.arange(round((0.15 + ROWS / RATE_HZ) * 5 * RATE_HZ)) / (5 * RATE_HZ)
     return make_interp_spline(grid_s, signal(grid_s), k=5)
 
@@ -166,12 +166,12 @@ def _waveforms(generator: np.random.Generator, noise: Callable[..., Noise], seed
     rows = _judged(values, signals, float(RATE_HZ), late_s + 1e-6 * generator.standard_normal())
     first, second = (each.name for each in CHANNELS)
     full_over_noise = FULL_MM / levels[0]
-    left = math.hypot(levels[0], jitter_s * gain * _slope(signals[0], t + curve_s))
+    residual = math.hypot(levels[0], jitter_s * gain * _slope(signals[0], t + curve_s))
     true = {
         ("gain", first): 1e6 * (gain - 1.0), ("offset", first): offset + means[0], ("start", first): curve_s[0],
         ("skew", second): 1e9 * skew_s, ("clock", ""): -1e6 * drift / (1.0 + drift), ("clock drift", ""): -1e6 * bend,
         ("noise", first): levels[0], ("jitter", first): 1e9 * jitter_s,
-        ("effective bits", first): math.log2(FULL_MM / left / math.sqrt(3.0)),
+        ("effective bits", first): math.log2(FULL_MM / residual / math.sqrt(3.0)),
         ("dynamic range", first): 20.0 * math.log10(full_over_noise / math.sqrt(2.0)),
     }  # fmt: skip
     return {key[0]: (rows[key].value, rows[key].low, rows[key].high, value) for key, value in true.items()}

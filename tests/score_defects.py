@@ -78,17 +78,17 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
         unit = "unit" if unit == "counts" else unit
         columns = convert_counts(sent, counts, unit)
         name = sent.channels[channel].name
-        told, values = columns[name]
+        stamps, values = columns[name]
         if what == "gain":
             # A gain about zero volts, or about a value of zero: with a bias it also moves the mean.
             columns[name] = (
-                told,
+                stamps,
                 values * (1.0 + float(g.choice([-1, 1])) * 1e-6 * float(np.exp(g.uniform(np.log(0.2), np.log(1000))))),
             )
             right, allowed = {"scale", "altered values"}, {"offset"}
         else:
             size = sent.channels[channel].lsb_v if unit == "V" else sent.channels[channel].scale
-            columns[name] = told, values + size * int(g.choice([-1, 1])) * round(np.exp(g.uniform(0.0, np.log(1000))))
+            columns[name] = stamps, values + size * int(g.choice([-1, 1])) * round(np.exp(g.uniform(0.0, np.log(1000))))
             right, allowed = {"offset", "altered values"}, set()
     elif what == "swapped channels":
         columns = convert_counts(sent, counts, unit)

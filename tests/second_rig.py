@@ -76,7 +76,7 @@ def _pair(u, k, P0):
 
 @njit(cache=True)
 def _rates(rig, t, omega0, pulse, v0, y, dy, seen):
-    """Return the rates of u, L, theta and the houses; `seen` receives the sensors' inputs."""
+    """Return the rates of u, L, theta and the housings; `seen` receives the sensors' inputs."""
     ux, uy, uz, Lx, Ly, Lz = y[0], y[1], y[2], y[3], y[4], y[5]
     vx, vy, vz = (Ly * uz - Lz * uy) / rig.Ixx, (Lz * ux - Lx * uz) / rig.Ixx, (Lx * uy - Ly * ux) / rig.Ixx
     w = (Lx * ux + Ly * uy + Lz * uz) / rig.Izz
@@ -135,12 +135,12 @@ def _run(rig, y, omega0, pulse, t0, steps, every, rows):
     h, v0, contacts = STEP_S, 0.0, 0
     for n in range(steps):
         t = t0 + n * h
-        seen = rows[n // every] if n % every == 0 else none
-        depth, rate = _rates(rig, t, omega0, pulse, v0, y, k1, seen)
+        inputs = rows[n // every] if n % every == 0 else none
+        depth, rate = _rates(rig, t, omega0, pulse, v0, y, k1, inputs)
         if depth > 0.0 and v0 == 0.0:
             v0 = max(rate, 1e-3)
             contacts += 1
-            _rates(rig, t, omega0, pulse, v0, y, k1, seen)
+            _rates(rig, t, omega0, pulse, v0, y, k1, inputs)
         elif depth <= 0.0:
             v0 = 0.0
         z[:] = y + 0.5 * h * k1

@@ -332,7 +332,7 @@ def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_jump_is_accepted_only_with_a_following_block() -> None:
     truth = Truth()
-    for numbers, taken, refused in (
+    for numbers, accepted, refused in (
         ([0, 1, 5, 6], [0, 1, 5, 6], 0),  # a gap
         ([0, 1, 5, 9, 10], [0, 1, 5, 9, 10], 0),  # two gaps in sequence
         ([0, *range(1, 30, 2)], [0, 1, *range(3, 15, 2)], 0),  # every other block; detection takes longer
@@ -356,7 +356,7 @@ def test_a_jump_is_accepted_only_with_a_following_block() -> None:
                     ),
                 )
             )
-        assert [each.block.index // truth.rows[PROBES] for each in found] == taken, numbers
+        assert [each.block.index // truth.rows[PROBES] for each in found] == accepted, numbers
         assert intake.refused == refused, numbers
 
 
@@ -388,8 +388,8 @@ def test_messages_of_another_session_are_skipped_and_counted(monkeypatch: pytest
         with ZenohClient(endpoint) as client:
             got: dict[bool, list[bytes]] = {True: [], False: []}
             events: list[bytes] = []
-            for lossless, taken in got.items():
-                client.subscribe(PROBES, lambda _, p, taken=taken: taken.append(p), lossless=lossless)
+            for lossless, payloads in got.items():
+                client.subscribe(PROBES, lambda _, p, payloads=payloads: payloads.append(p), lossless=lossless)
             client.subscribe(wire.EVENTS, lambda _, p: events.append(p), history=True)
             # Until both subscriptions are active, blocks that the lossy one misses are not recovered.
             number = 0
@@ -402,9 +402,9 @@ def test_messages_of_another_session_are_skipped_and_counted(monkeypatch: pytest
 
             until(reached, every_s=0.05)
             begun = number + 1
-            until(lambda: all(taken[-1] == truth.payload(PROBES, number) for taken in got.values()))
-            for taken in got.values():
-                taken.clear()
+            until(lambda: all(payloads[-1] == truth.payload(PROBES, number) for payloads in got.values()))
+            for payloads in got.values():
+                payloads.clear()
             config = zenoh.Config()
             for name, value in (
                 ("mode", "client"), ("connect/endpoints", [f"tcp/{endpoint}"]), ("scouting/multicast/enabled", False),
@@ -420,7 +420,7 @@ def test_messages_of_another_session_are_skipped_and_counted(monkeypatch: pytest
                     forger.put(f"{PROBES}/@adv/pub/{forger.zid()}/1/_", b"\x07\x00\x00\x00")
                     time.sleep(0.002)
                 sent = [truth.payload(PROBES, number) for number in range(begun, begun + 50)]
-                until(lambda: all(len(taken) >= 50 for taken in got.values()) and client.foreign >= 4 * 50)
+                until(lambda: all(len(payloads) >= 50 for payloads in got.values()) and client.foreign >= 4 * 50)
             assert got == {True: sent, False: sent}
             assert events == []
             assert client.foreign >= 4 * 50

@@ -568,7 +568,7 @@ def test_instruments_reply_to_all_requests_and_execute_valid_ones_only() -> None
 def test_frames_of_a_serial_line_are_whole_or_dropped() -> None:
     random = np.random.default_rng(8)
     deframer = Deframer(1000)
-    taken = 0
+    frame_count = 0
     for _ in range(input_count(3000)):
         message = random.bytes(int(random.integers(0, 1200)))
         line = encode_frame(message) if random.random() < 0.3 else mutate(random, encode_frame(message))
@@ -581,9 +581,9 @@ def test_frames_of_a_serial_line_are_whole_or_dropped() -> None:
         cut = int(random.integers(len(line) + 1))
         found = [*deframer.feed(b"\0" + line[:cut]), *deframer.feed(line[cut:] + b"\0")]
         assert found == good
-        taken += len(found)
+        frame_count += len(found)
         assert len(deframer) <= 1100
-    assert taken > 500
+    assert frame_count > 500
 
 
 def _crc(data: bytes) -> int:
@@ -644,7 +644,7 @@ def test_false_frames_do_not_stop_a_daq_and_are_counted() -> None:
     channel = f"hostile-{next(_channels)}"
     table = default_messages()
     source = CanSource(f"virtual:{channel}")
-    taken: list[Any] = []
+    blocks: list[Any] = []
     ended: list[str] = []
     try:
         with can.Bus(channel, interface="virtual", ignore_config=True) as rig:
@@ -657,7 +657,7 @@ def test_false_frames_do_not_stop_a_daq_and_are_counted() -> None:
             say("Sync", index=0, time=0)
             say("Samples_1", index=0)
             names = list(source.streams())
-            source.start(names, None, lambda name, samples: taken.append(samples), lambda name, why: ended.append(why))
+            source.start(names, None, lambda name, samples: blocks.append(samples), lambda name, why: ended.append(why))
             rows = [row for row in table.messages if row.name not in ("Rates", "Heartbeat")]
             for number in range(input_count(3000)):
                 row = rows[random.integers(len(rows))]
@@ -667,7 +667,7 @@ def test_false_frames_do_not_stop_a_daq_and_are_counted() -> None:
                     say("Sync", index=0, time=0)  # otherwise it assumes that the rig has ended
                     source.take(int(random.integers(1 << 11)), random.bytes(8))
                     source.deliver()
-                    taken.clear()
+                    blocks.clear()
             for _ in range(200):
                 source.take(table.by_name["Rates"].identifier, random.bytes(8))
                 source.take(table.by_name["Samples_1"].identifier, random.bytes(table.by_name["Samples_1"].length))
@@ -675,9 +675,9 @@ def test_false_frames_do_not_stop_a_daq_and_are_counted() -> None:
             assert source.statistics["malformed"] > 10
             say("Rates", rate=20_000, fd_step=0, classic_step=20, latency=0)
             until(lambda: source.rates is not None and source.rates["rate"] == 20_000)
-            before = len(taken)
+            before = len(blocks)
             say("Samples_1", index=500)
-            until(lambda: len(taken) > before)
+            until(lambda: len(blocks) > before)
             assert not ended
             assert any(
                 thread.name.startswith("can ") and thread.name.endswith(" reads") for thread in threading.enumerate()
@@ -689,15 +689,15 @@ def test_false_frames_do_not_stop_a_daq_and_are_counted() -> None:
 def test_a_node_for_links_outlives_frames_of_all_kinds() -> None:
     random = np.random.default_rng(11)
     channel = f"hostile-{next(_channels)}"
-    heard: list[can.Message] = []
+    received: list[can.Message] = []
     node = CanNode(f"virtual:{channel}", [0x601])
     try:
-        node.listen(0x601, heard.append)
+        node.listen(0x601, received.append)
         with can.Bus(channel, interface="virtual", ignore_config=True) as villain:
             for _ in range(input_count(1000)):
                 villain.send(make_frame(random, 0))
             villain.send(can.Message(arbitration_id=0x601, data=b"end", is_extended_id=False))
-            until(lambda: bool(heard) and bytes(heard[-1].data) == b"end")
-        assert {frame.arbitration_id for frame in heard} == {0x601}
+            until(lambda: bool(received) and bytes(received[-1].data) == b"end")
+        assert {frame.arbitration_id for frame in received} == {0x601}
     finally:
         node.close()

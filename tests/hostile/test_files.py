@@ -181,10 +181,10 @@ def _bomb(declared: int, packed: bytes, compression: bytes, checksum: int) -> by
     return struct.pack("<BQ", 6, len(body)) + body
 
 
-def _packed(size: int, *, told: int | None) -> bytes:
+def _packed(size: int, *, stated_size: int | None) -> bytes:
     """Return a zstd frame of `size` zeros, four bytes per 128 KiB (RFC 8878), with or without its size declared."""
-    head = struct.pack("<IB", 0xFD2FB528, 0xC0 if told is not None else 0) + bytes([7 << 3])
-    head += b"" if told is None else struct.pack("<Q", told)
+    head = struct.pack("<IB", 0xFD2FB528, 0xC0 if stated_size is not None else 0) + bytes([7 << 3])
+    head += b"" if stated_size is None else struct.pack("<Q", stated_size)
     count = size >> 17
     block = struct.pack("<I", (1 << 17) << 3 | 1 << 1)[:3] + b"\0"
     last = struct.pack("<I", (1 << 17) << 3 | 1 << 1 | 1)[:3] + b"\0"
@@ -193,16 +193,16 @@ def _packed(size: int, *, told: int | None) -> bytes:
 
 @pytest.mark.parametrize("cut", [0, 40])
 @pytest.mark.parametrize(
-    ("compression", "declared", "told"),
+    ("compression", "declared", "stated_size"),
     [
-        *((b"zstd", declared, told) for declared in (4 << 30, 1 << 20) for told in (4 << 30, 1 << 20, None)),
+        *((b"zstd", declared, size) for declared in (4 << 30, 1 << 20) for size in (4 << 30, 1 << 20, None)),
         *((name, size, None) for name in (b"lz4", b"", b"zstd") for size in (2**63, 1 << 20)),
     ],
 )
 def test_a_packed_chunk_of_4_gb_is_refused_before_it_is_unpacked(
-    part: Path, tmp_path: Path, cut: int, compression: bytes, declared: int, told: int | None
+    part: Path, tmp_path: Path, cut: int, compression: bytes, declared: int, stated_size: int | None
 ) -> None:
-    packed = _packed(4 << 30, told=told)
+    packed = _packed(4 << 30, stated_size=stated_size)
     assert len(packed) < 132_000
     bomb = tmp_path / "bomb.mcap.part"
     chunk = _bomb(declared, packed, compression, zlib.crc32(bytes(1 << 20)))

@@ -44,12 +44,12 @@ NOTEBOOK_FUNCTIONS = (
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_of_a_module(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)  # folder of the reference sessions
-    said: list[str] = []
+    output: list[str] = []
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     for example in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(name)):
-        runner.run(example, out=said.append)
+        runner.run(example, out=output.append)
     assert runner.tries > 0
-    assert runner.failures == 0, "".join(said)
+    assert runner.failures == 0, "".join(output)
 
 
 # Warnings of matplotlib about its own layout.

@@ -44,7 +44,7 @@ def run_with_cuts(*cuts: int, scene: str = "hammer", overrides: dict[str, Any] |
     rows, edges, events = [], [], []
     samples: dict[str, list[np.ndarray]] = {}
     truth: dict[str, list[np.ndarray]] = {}
-    seen: dict[str, int] = {}
+    next_rows: dict[str, int] = {}
     while simulation.tick < END:
         tick = simulation.tick
         for name, request in COMMANDS.get(tick, []):
@@ -57,13 +57,13 @@ def run_with_cuts(*cuts: int, scene: str = "hammer", overrides: dict[str, Any] |
         events += frame.events
         for kind, kept, made in (("samples", samples, frame.samples), ("truth", truth, frame.truth)):
             for name, block in made.items():
-                due = seen.get(f"{kind} {name}", 0)
+                due = next_rows.get(f"{kind} {name}", 0)
                 assert (block.tick, block.index) == (tick, due), "no row is missing between two blocks"
-                seen[f"{kind} {name}"] = due + len(block.values)
+                next_rows[f"{kind} {name}"] = due + len(block.values)
                 kept.setdefault(name, []).append(block.values)
         if frame.edges is not None:
-            assert frame.edges.index == seen.get("edges", 0)
-            seen["edges"] = frame.edges.index + len(frame.edges.values)
+            assert frame.edges.index == next_rows.get("edges", 0)
+            next_rows["edges"] = frame.edges.index + len(frame.edges.values)
             edges.append(frame.edges.tick + frame.edges.values[:, 0])
     return RunOutput(
         rows=np.concatenate(rows),

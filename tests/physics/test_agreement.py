@@ -228,5 +228,5 @@ def test_transducer_pairs_carry_the_load_in_halves(whirl: Run) -> None:
     preload = whirl.simulation.model.constants.house.preload
     np.testing.assert_allclose(whirl["P_N"] - preload, -(whirl["P_S"] - preload), atol=1e-8)
     amplitude = np.ptp((whirl["P_E"] - whirl["P_W"])[whirl.times_s > 1.5]) / 2
-    # The reaction carries the normal force and the inertia of the houses.
+    # The reaction carries the normal force and the inertia of the housings.
     assert 500.0 < amplitude < 620.0

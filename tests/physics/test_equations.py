@@ -9,7 +9,7 @@
 | forced whirl                     | closed form of the linear rotor       | unbalance: size, phase, sense            |
 | spin-up, hammer alone            | exponential, A d 2/pi                 | drive and pulse                          |
 | sliding impact                   | tangential = mu x normal impulse      | friction's sign and size                 |
-| house under a steady load        | springs in series and parallel        | house equations                          |
+| housing under a steady load      | springs in series and parallel        | housing equations                        |
 | lost preload                     | half the stiffness; the stored energy | one-sided transducers                    |
 """
 
@@ -147,7 +147,7 @@ def test_angular_momentum_grows_by_the_moments_in_space(seed: int, ideal: bool) 
         assert out[9] == 0.0
     else:
         assert rest @ a == pytest.approx(0.1 * (50.0 - y[9]), abs=1e-7 * scale)
-    # The house receives the opposite force.
+    # The housing receives the opposite force.
     x = house.inner_mass * out[10] + house.outer_mass * out[12] + house.pair_stiffness_horizontal * y[5]
     up = house.inner_mass * out[11] + house.outer_mass * out[13]
     up += house.outer_beam_damping * y[13] + house.outer_beam_stiffness * y[6]

@@ -8,7 +8,7 @@
 | rigid impact, oblique         | closed form: Coulomb impulse, rolled or slid | Coulomb's law on impulses            |
 | rigid impacts, ledgers        | zero residual                                | first law                            |
 | rigid impacts, whirl          | rolls at R_S spin / r0, force M_eff r0 w^2   | kinematics and centrifugal force     |
-| rigid ring                    | a higher peak than on houses                 | nothing yields (numerics: +57 %)     |
+| rigid ring                    | a higher peak than on housings               | nothing yields (numerics: +57 %)     |
 | fixed bodies of the stator    | transducers transmit the ring's force        | statics                              |
 | ideal drive                   | the prescribed spin                          | definition                           |
 | lowered levels                | no more steps of the engine                  | omitted parts cost nothing           |
@@ -178,11 +178,11 @@ def test_rigid_impacts_whirl_by_the_kinematics() -> None:
 
 
 def test_rigid_ring_hits_harder_and_whirls_faster() -> None:
-    houses, rigid = Run("hammer", 1.0), Run("hammer", 1.0, **{"model.stator": "rigid"})
+    housings, rigid = Run("hammer", 1.0), Run("hammer", 1.0, **{"model.stator": "rigid"})
     impacts = Run("hammer", 1.0, **IMPACT)
-    peaks = [run.simulation.health()["peak_normal_force_n"] for run in (houses, rigid)]
+    peaks = [run.simulation.health()["peak_normal_force_n"] for run in (housings, rigid)]
     assert peaks[1] / peaks[0] == pytest.approx(1.57, abs=0.06)
-    f = [measure_whirl(run) for run in (houses, rigid, impacts)]
+    f = [measure_whirl(run) for run in (housings, rigid, impacts)]
     assert 1.001 < f[1] / f[0] < 1.006
     assert f[2] == pytest.approx(f[1], rel=2e-4)  # the same law once it rolls
     # An impact has no force; the contact that lasts has.

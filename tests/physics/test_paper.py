@@ -8,8 +8,8 @@
 | whirl frequency                       | -Omega R_S / (r0 + delta), delta by Hertz at m r (w^2 - w_n^2)     |
 | force in the whirl, rigid ring        | m r (w^2 - w_n^2), what bends the path                             |
 | slowest whirl that friction speeds up | w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)], eq. 43                      |
-| least friction that keeps up whirl    | the same, solved for mu; with the houses' loss in the full rig     |
-| what whirl costs the houses           | forced vibration of two masses on a line                           |
+| least friction that keeps up whirl    | the same, solved for mu; with the housings' loss in the full rig   |
+| what whirl costs the housings         | forced vibration of two masses on a line                           |
 | swing of the friction in rolling      | m w^2 |X - Y|/2 of the ring's ellipse                              |
 | spin kept from slipping to rolling    | I_zz spin + m R_S v is kept; of a slip from rest I_zz/(I_zz+m R_S^2) |
 | time from slipping to rolling         | mu (w^2 - w_n^2) = w', integrated by quadrature                    |
@@ -136,7 +136,7 @@ def test_minimum_friction_for_whirl(spin_hz):
     (found,) = condition.sustain_thresholds((spin_hz,))
     assert found.bare == pytest.approx(drag / normal, rel=5e-3)
     assert found.closed == pytest.approx(drag / normal, rel=1e-6)
-    # The houses take a share of it. In moving houses the force is higher, and their loss grows with its square.
+    # The housings take a share of it. In moving housings the force is higher, and their loss grows with its square.
     assert found.full == pytest.approx(found.with_houses, rel=0.07)
     assert found.full == pytest.approx(found.used[0], rel=0.03)
     # It rolls through the whole turn only with far more friction.
@@ -168,7 +168,7 @@ def test_house_loss_agrees_with_forced_vibration():
 
 @pytest.mark.parametrize(("stator", "share"), [("two-houses", 1.0), ("rigid", 0.0)])
 def test_friction_varies_with_the_ellipse_of_the_ring(stator, share):
-    """Equal damping in x and y, no weight, no unbalance: the houses alone cause the swing at twice the whirl
+    """Equal damping in x and y, no weight, no unbalance: the housings alone cause the swing at twice the whirl
     frequency.
     """
     constants, spin = base_model(ModelLevels(stator=stator)).constants, 2 * math.pi * 9.0

@@ -3,7 +3,7 @@
 | what                                   | must agree with                                             |
 |----------------------------------------|-------------------------------------------------------------|
 | state after any time                   | the matrix exponential                                      |
-| house loss and impulse                 | the power of the dashpots and the force, by quadrature      |
+| housing loss and impulse               | the power of the dashpots and the force, by quadrature      |
 | a run of impacts                       | `taylor`, which follows the ringing by series               |
 | contacts and peak force                | the same: no impact is missed under a housing that swings   |
 | rows                                   | the same bits, however the run is cut into calls            |
@@ -70,10 +70,10 @@ def test_ringing_is_the_matrix_exponential(changes: dict[str, Any]) -> None:
     moves = 1.0 if constants.levels.outer_house else 0.0
     for row, value in zip(ROWS[0] + ROWS[1], (3e-6, -2e-6, 0.01, 0.02, -1e-6, 4e-6, -0.03, 0.01), strict=True):
         start[row] = value * (moves if row in (S.X_OH, S.Y_OH, S.VX_OH, S.VY_OH) else 1.0)
-    left = start.copy()
-    assert start_ringing(constants, memory, left, -5e-4, 0.0)
+    remainder = start.copy()
+    assert start_ringing(constants, memory, remainder, -5e-4, 0.0)
     assert memory[RINGING] == 1.0
-    assert not left[: S.N_STATE].any()
+    assert not remainder[: S.N_STATE].any()
     times = np.linspace(0.0, 2e-3, 2001)
     runs = np.zeros((len(times), S.N_VECTOR))
     for time, run in zip(times, runs, strict=True):

@@ -88,10 +88,10 @@ def test_linear_bodies_respond_as_in_closed_form(parameters: str, monkeypatch: p
 
     monkeypatch.setattr("rig.physics.engines.split.radau.invert", get_python_function(invert))
     scene, power = load_scene("hammer", {"parameters": parameters}), 3
-    shafts, houses = get_python_function(body_matrices)(
+    shafts, housings = get_python_function(body_matrices)(
         build_model(scene.load_parameters(), scene.model).constants, INPUTS
     )
-    for Z in (*shafts, *houses):
+    for Z in (*shafts, *housings):
         n, h = len(Z), 0.5 / np.abs(np.linalg.eigvals(Z)).max()
         free, forced = np.empty((n, n, STAGES)), np.empty((n, STAGES, STAGES))
         get_python_function(collocate)(Z, n // 2, -2.0, h, free, forced)
@@ -127,9 +127,9 @@ def test_linear_bodies_are_the_kernels(changes: dict[str, Any]) -> None:
     constants = make_simulation("split", 1e-3, model__magnet="linear", **changes).model.constants
     # Weight turns the shaft, and with it the spin: no part of a linear body.
     constants = constants._replace(shaft=constants.shaft._replace(gravity=0.0))
-    shafts, houses = body_matrices(pack_record(constants)[0], pack_record(INPUTS)[0])
+    shafts, housings = body_matrices(pack_record(constants)[0], pack_record(INPUTS)[0])
     matrix = np.zeros((14, 14))
-    for first, block in zip((0, 2, 4, 6, 10), (*shafts, *houses), strict=True):
+    for first, block in zip((0, 2, 4, 6, 10), (*shafts, *housings), strict=True):
         matrix[first : first + len(block), first : first + len(block)] = block
     small, found, out = 1e-6, np.empty((14, 14)), np.full(S.N_OBSERVED, np.nan)
     for column in range(14):

@@ -2,7 +2,7 @@
 
 | what                                   | must agree with                                          |
 |----------------------------------------|----------------------------------------------------------|
-| series of a ringing house              | the cosine, and the cosine's own remainder after order 16 |
+| series of a ringing housing            | the cosine, and the cosine's own remainder after order 16 |
 | first coefficients of any phase        | the kernels' equations, and how those change             |
 | code of the series                     | the code that the equations generate now                 |
 | first zero of a polynomial             | the roots from which it was constructed                  |

@@ -208,7 +208,7 @@ SUBJECTS = [
 def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: str, folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     permissions = get_permissions(name)
-    seen: list[tuple[str, bytes]] = []
+    inbox: list[tuple[str, bytes]] = []
     with (
         ZenohServer(plain, exposed=Exposure(exposed, read_holder(folders / "server", server=True))) as server,
         NormalClient(plain) as honest,
@@ -218,8 +218,8 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         ) as session,
     ):
         rig = Rig(server)
-        honest.subscribe("rig/**", lambda key, payload: seen.append((key, payload)), lossless=False)
-        beside.declare_subscriber("rig/**", lambda sample: seen.append((str(sample.key_expr), bytes(sample.payload))))
+        honest.subscribe("rig/**", lambda key, payload: inbox.append((key, payload)), lossless=False)
+        beside.declare_subscriber("rig/**", lambda sample: inbox.append((str(sample.key_expr), bytes(sample.payload))))
         attempt = Attempt(session)
         # A link keeps its order: after the reply to a request everything before it has been received.
         answers = {key: attempt.answered(key) for key in map(example, KEYS)}
@@ -239,7 +239,7 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
             if permission.action is Action.WATCH
             for key in honest.tokens(example(permission.keys[0]))
         }
-        asked = {honest.request(key) for key in keys_of(PERMISSIONS, Action.ASK)}
+        honest_replies = {honest.request(key) for key in keys_of(PERMISSIONS, Action.ASK)}
         selectors = ("rig/command/unknown", "rig/**", "rig/**/@adv/**?_max=1", "rig/sensors/unknown/@adv/**")
         victims = (honest.session, beside)
         replies = [reply for victim in victims for selector in selectors for reply in get_all_replies(victim, selector)]
@@ -248,7 +248,7 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         rig.announce()
         until(lambda: all(map(attempt.sees, keys_of(permissions, Action.WATCH))))
         tokens = {key for key in keys_of(PERMISSIONS, Action.WATCH) if attempt.sees(key)}
-        until(lambda: len({key for key, _ in seen}) >= len(receivable(PERMISSIONS)))
+        until(lambda: len({key for key, _ in inbox}) >= len(receivable(PERMISSIONS)))
         assert {key for key, found in answers.items() if found} == keys_of(permissions, Action.ASK)
         assert attempt.received == allowed
         assert attempt.heartbeats == allowed
@@ -257,9 +257,9 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         assert {key for key in rig.shown if key in map(example, KEYS)} == keys_of(permissions, Action.SHOW)
         assert tokens == keys_of(permissions, Action.WATCH)
         assert forged_tokens == set()
-        assert asked == {b"honest"}
+        assert honest_replies == {b"honest"}
         assert FORGED not in {bytes(reply.result.payload) for reply in replies}
-        assert {payload for _, payload in seen} == {b"honest"}, "nothing that a client puts reaches another"
+        assert {payload for _, payload in inbox} == {b"honest"}, "nothing that a client puts reaches another"
 
 
 @pytest.mark.parametrize(
@@ -343,16 +343,16 @@ def test_clients_report_the_reason_of_a_refusal(folders: Path) -> None:
 
 def test_an_exposed_rig_limits_links_and_message_size(folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
-    heard: list[int] = []
+    sizes: list[int] = []
     with ExitStack() as stack:
         holder = read_holder(folders / "server", server=True)
         server = stack.enter_context(ZenohServer(plain, exposed=Exposure(exposed, holder)))
-        server.subscribe_reports("rig/clients/*", lambda _, payload: heard.append(len(payload)))
+        server.subscribe_reports("rig/clients/*", lambda _, payload: sizes.append(len(payload)))
         session = stack.enter_context(open_hostile_session(f"tls/{exposed}", folder=folders / "recorder"))
         for size in (100, 500_000, 2 << 20, 101):
             session.put("rig/clients/a", bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
-        until(lambda: bool(heard) and heard[-1] == 101)
-        assert heard == [100, 500_000, 101]
+        until(lambda: bool(sizes) and sizes[-1] == 101)
+        assert sizes == [100, 500_000, 101]
         for _ in range(31):
             stack.enter_context(open_hostile_session(f"tls/{exposed}", folder=folders / "viewer"))
         with pytest.raises(zenoh.ZError), open_hostile_session(f"tls/{exposed}", folder=folders / "viewer"):

@@ -281,11 +281,11 @@ def test_ctrl_c_ends_all_processes_and_reports_finished_cases(tmp_path: Path) ->
         waiting.until(
             lambda: devices() >= 4, timeout_s=processes.COMPILE_S, every_s=0.1
         )  # each with its cleanup process
-        left = descendants(child.pid)
+        remaining = descendants(child.pid)
         os.killpg(child.pid, signal.SIGINT)
         out, err = child.communicate(timeout=60.0)
     assert child.returncode == 130, out + err
-    waiting.until(lambda: not any(each.is_running() and each.status() != "zombie" for each in left), every_s=0.1)
+    waiting.until(lambda: not any(each.is_running() and each.status() != "zombie" for each in remaining), every_s=0.1)
     assert "1 passed, 3 not run" in out
     results = json.loads((tmp_path / "out/results.json").read_text(encoding="utf-8"))
     assert results["counts"] == {

@@ -71,13 +71,13 @@ def run_devices(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
         machine.step(100_000)
         machine.hammer(force_n=150.0)
         assert machine.step(200_000).lost == {}
-        said = []
+        outputs = []
         for device in (guard, plain):
             output, errors = device.communicate(timeout=30.0)
             assert errors == ""
-            said.append(output)
+            outputs.append(output)
         events = [machine.event(name) for name in ("speed", "device", "speed", "device")]
-    return said, [{name: value for name, value in event.items() if name != "wall_s"} for event in events]
+    return outputs, [{name: value for name, value in event.items() if name != "wall_s"} for event in events]
 
 
 def test_devices_over_zenoh_and_can_react_at_the_same_ticks_at_any_speed() -> None:
@@ -135,11 +135,11 @@ def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
             with pytest.raises(RefusedError, match="speed was refused over CAN: out of range"):
                 device.speed(1000.0)
             stepped: list[AcceptedStep] = []
-            told: list[dict[str, Any]] = []
+            events: list[dict[str, Any]] = []
 
             def step() -> None:
                 # The device joins when it requests its first rows.
-                told.append(machine.event("device", timeout_s=PATIENCE_S))
+                events.append(machine.event("device", timeout_s=PATIENCE_S))
                 stepped.append(machine.step(30_000))
 
             steps = threading.Thread(target=step)
@@ -156,8 +156,8 @@ def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
             assert (fault.fault, fault.channels, fault.first_row) == (1, ("P_E",), {"forces": 600})
             assert [device.event("hammer")["force_n"] for _ in range(2)] == [80.0] * 2
             assert stepped[0].lost == {}
-        told.append(machine.event("device"))
-        assert [(each["device"], each["state"], each["tick"]) for each in told] == [
+        events.append(machine.event("device"))
+        assert [(each["device"], each["state"], each["tick"]) for each in events] == [
             ("CAN 3", "joined", 0),
             ("CAN 3", "left", 30_000),
         ]

@@ -139,11 +139,11 @@ class Reader:
             capture_output=True,
             timeout=COMPILE_S if not _RUNS_LONG_BLOCKS else None,
         )
-        said = f"{command}\n{stdin or ''}{done.stdout}{done.stderr}"
+        output = f"{command}\n{stdin or ''}{done.stdout}{done.stderr}"
         if command.startswith("rig info") and "inconclusive: accuracy" in done.stdout:
             status = 3  # the phase of a live impact decides whether its error estimate warns
-        assert done.returncode == status, said
-        assert "Traceback" not in done.stderr, said
+        assert done.returncode == status, output
+        assert "Traceback" not in done.stderr, output
 
     def _start(self, terminal: str, command: str, status: int) -> None:
         if terminal in self.terminals:

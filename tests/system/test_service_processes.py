@@ -238,10 +238,10 @@ def test_the_commands_reach_a_rig_in_lockstep() -> None:
             listener = Listener(client)
             assert invoke(endpoint, "stop").startswith("stop accepted: number 6")
             until(lambda: bool(listener.events) and listener.events[-1]["event"] == "end")
-            taken = [event for event in listener.events if event["event"] == "command"]
-        assert [event["command"] for event in taken] == ["step", "hammer", "hammer", "speed", "release", "stop"]
-        assert [event["request"].get("direction") for event in taken[1:3]] == ["x", 30.0]
-        assert all(event["from"].startswith(f"rig {event['command']} pid ") for event in taken)
+            commands = [event for event in listener.events if event["event"] == "command"]
+        assert [event["command"] for event in commands] == ["step", "hammer", "hammer", "speed", "release", "stop"]
+        assert [event["request"].get("direction") for event in commands[1:3]] == ["x", 30.0]
+        assert all(event["from"].startswith(f"rig {event['command']} pid ") for event in commands)
         assert child.wait(timeout=30.0) == 0
 
 

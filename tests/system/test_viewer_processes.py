@@ -234,12 +234,12 @@ class BusyViewer:
 
 def test_a_busy_viewer_is_retried_and_then_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(window, "ViewerClient", BusyViewer)
-    said: list[str] = []
+    messages: list[str] = []
     monkeypatch.setattr(window, "_MESSAGE_INTERVAL_S", 0.0)
-    with Window("web", on_message=said.append) as shown:
+    with Window("web", on_message=messages.append) as shown:
         shown.picture(tmp_path / "busy.png", at_s=1.0, end_s=2.0)
         assert (tmp_path / "busy.png").read_bytes() == BusyViewer.picture
-        assert said[-1].startswith("waiting for the viewer for ")
+        assert messages[-1].startswith("waiting for the viewer for ")
         monkeypatch.setattr(window, "_REPLY_TIMEOUT_S", 0.3)
         with pytest.raises(WindowError, match="did not load the recording within"):
             shown.picture(tmp_path / "never.png", at_s=1.0, end_s=3.0)
@@ -247,10 +247,10 @@ def test_a_busy_viewer_is_retried_and_then_refused_in_one_line(tmp_path: Path, m
 
 
 def test_a_taken_port_is_avoided() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        port = listener.getsockname()[1]
         assert free_port(port) != port
 
 

@@ -152,7 +152,7 @@ def some_fault(rng: random.Random) -> dict[str, Any]:
 def test_random_faults_have_their_names(tmp_path: Path) -> None:
     """95 of 100 faults that change a count have the right name, and at most one a wrong one."""
     rng = random.Random(int(os.environ.get("RIG_BLIND_SEED", "2030")))
-    seen, wrong, unnamed = 0, list[str](), list[str]()
+    total, wrong, unnamed = 0, list[str](), list[str]()
     for n in range(int(os.environ["RIG_BLIND_FAULTS"])):
         pulse = {"at_s": 0.02, "command": "hammer", "force_n": rng.uniform(1.0, 150.0), "duration_ms": 5.0}
         fault, speed = some_fault(rng), rng.choice((6.2, rng.uniform(4.0, 14.9)))
@@ -163,15 +163,15 @@ def test_random_faults_have_their_names(tmp_path: Path) -> None:
         (tmp_path / f"{n}.mcap").unlink()
         if not differ:
             continue
-        seen += 1
+        total += 1
         if not is_named_right(explanations, fault["channel"], fault["kind"]):
             line = (
                 f"{n}: {speed:.4g} Hz, {pulse['force_n']:.4g} N, {fault}: {[(o.name, o.change) for o in explanations]}"
             )
             (wrong if any(one.sure for one in explanations) else unnamed).append(line)
-    print(f"{seen} faults: {len(wrong)} wrong, {len(unnamed)} unnamed", *wrong, *unnamed, sep="\n")
-    assert len(wrong) <= 0.01 * seen
-    assert len(unnamed) <= 0.05 * seen
+    print(f"{total} faults: {len(wrong)} wrong, {len(unnamed)} unnamed", *wrong, *unnamed, sep="\n")
+    assert len(wrong) <= 0.01 * total
+    assert len(unnamed) <= 0.05 * total
 
 
 def test_a_common_fault_and_one_without_truth_are_reported(tmp_path: Path) -> None:

@@ -108,12 +108,13 @@ def test_each_by_its_definition(sound: dict[str, Sent]) -> None:
     again = run({"kind": "restart"})[0][PROBES]
     assert [index for index, _, _ in again] == [*range(0, first, 200), *range(0, 4000, 200), *range(6000, 8000, 200)]
     assert all(tick == index * 50 for index, tick, _ in again)
-    simulation, came = Simulation(SCENE), list[int]()
+    simulation, counts = Simulation(SCENE), list[int]()
     for n in range(40):
         if n == 10:
             simulation.submit("fault", {"channel": "probes", "for_s": 0.2, "kind": "late-blocks", "delay_s": 0.033})
-        came.append(sum(message.key == PROBES for message in simulation.advance(10_000).messages))
-    assert came == [*[1] * 10, 0, 0, 0, 0, *[1] * 16, 5, *[1] * 9]  # 33 ms have passed in the block that ends at 40 ms
+        counts.append(sum(message.key == PROBES for message in simulation.advance(10_000).messages))
+    # 33 ms have passed in the block that ends at 40 ms.
+    assert counts == [*[1] * 10, 0, 0, 0, 0, *[1] * 16, 5, *[1] * 9]
 
 
 def test_a_fault_on_one_transport_does_not_affect_the_other(sound: dict[str, Sent]) -> None:
@@ -137,10 +138,10 @@ def send_through(what: Any, blocks: int, seed: int = 5) -> list[int]:
 @pytest.mark.parametrize("part", [0.1, 0.6])
 def test_random_faults_have_their_rate_and_are_independent(part: float) -> None:
     n = 2000
-    came = np.isin(np.arange(n), send_through(LoseBlocks(part=part), n))
+    sent = np.isin(np.arange(n), send_through(LoseBlocks(part=part), n))
     sigma = math.sqrt(part * (1.0 - part) / n)
-    assert abs(1.0 - came.mean() - part) < 4.0 * sigma
-    x = came - came.mean()
+    assert abs(1.0 - sent.mean() - part) < 4.0 * sigma
+    x = sent - sent.mean()
     assert abs(float(x[1:] @ x[:-1]) / float(x @ x)) < 4.0 / math.sqrt(n)
     assert send_through(LoseBlocks(part=part), 300) != send_through(LoseBlocks(part=part), 300, seed=6)
     twice = send_through(DuplicateBlocks(part=part), n)
@@ -193,8 +194,8 @@ def test_listed_combinations_are_accepted_and_others_refused(scene: str) -> None
             fits = any if cls.channel_only else all
             try:
                 simulation.submit("fault", {"channel": target, "kind": kind, **number})
-                taken = True
+                legal = True
                 simulation.submit("clear", {})
             except InputError:
-                taken = False
-            assert taken == fits(listed.get(name, "not there") == "" for name in names), (kind, target)
+                legal = False
+            assert legal == fits(listed.get(name, "not there") == "" for name in names), (kind, target)

@@ -23,15 +23,15 @@ def test_a_full_queue_refuses_drops_the_oldest_or_waits() -> None:
 
 def test_a_wait_for_room_or_an_item_ends() -> None:
     queue = BoundedQueue[int](1)
-    taken: list[int | None] = []
-    reader = threading.Thread(target=lambda: taken.extend(queue.take(10.0) for _ in range(3)))
+    items: list[int | None] = []
+    reader = threading.Thread(target=lambda: items.extend(queue.take(10.0) for _ in range(3)))
     reader.start()
     assert queue.put(1, 10.0)
     assert queue.put(2, 10.0)
     assert queue.wait_for_room(10.0)
     queue.close()
     reader.join(10.0)
-    assert taken == [1, 2, None]
+    assert items == [1, 2, None]
 
 
 def test_a_taken_item_counts_until_the_next_is_taken() -> None:

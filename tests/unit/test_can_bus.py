@@ -307,14 +307,14 @@ def test_counters_states_and_bus_off():
     bus.disturb(a, count=32)
     bus.offer(a, EMPTY, 0)
     bus.offer(a, Frame(0x600), 0)
-    seen = []
+    states = []
     for step in range(1, 4000):
         bus.advance(step * 5 * US)
         state = bus.node(a)
-        if not seen or seen[-1] != (state.state, state.tec):
-            seen.append((state.state, state.tec))
+        if not states or states[-1] != (state.state, state.tec):
+            states.append((state.state, state.tec))
     expected = [(("error active", "error passive", "bus-off")[(8 * k > 127) + (8 * k > 255)], 8 * k) for k in range(33)]
-    assert seen == [*expected, ("error active", 0)]
+    assert states == [*expected, ("error active", 0)]
     assert (bus.node(a).bus_offs, bus.node(a).errors, bus.node(a).refused, bus.node(a).queued) == (1, 32, 1, 0)
     assert (bus.node(b).rec, bus.node(b).state) == (32, "error active")
 
@@ -430,16 +430,16 @@ def test_random_errors_come_at_their_rate_and_by_the_seed():
 def test_load_is_the_time_taken_by_windows():
     bus, a, _ = pair()
     frame = Frame(0x123, bytes(8))
-    taken = duration_us(frame)
+    busy_us = duration_us(frame)
     for k in range(100):
         bus.offer(a, frame, k * 2 * MS)
     bus.advance(150 * MS)
-    assert bus.state().window_load == pytest.approx(50 * taken / 100_000)
+    assert bus.state().window_load == pytest.approx(50 * busy_us / 100_000)
     bus.advance(200 * MS)
-    assert bus.state().load == pytest.approx(taken / 2000)
+    assert bus.state().load == pytest.approx(busy_us / 2000)
     bus.advance(400 * MS)
     state = bus.state()
-    assert (state.load, state.window_load) == (pytest.approx(taken / 4000), 0.0)
+    assert (state.load, state.window_load) == (pytest.approx(busy_us / 4000), 0.0)
     # An overloaded bus has a load of one, and no idle window.
     array = np.repeat(records([frame]), 6000)
     array["node"] = a

@@ -31,9 +31,9 @@ class CountingNode(HubBus):
 
     heard = 0
 
-    def receive(self, said: codec.HubMessage) -> None:
-        self.heard += isinstance(said, np.ndarray)
-        super().receive(said)
+    def receive(self, message: codec.HubMessage) -> None:
+        self.heard += isinstance(message, np.ndarray)
+        super().receive(message)
 
 
 def make(identifiers: Any) -> np.ndarray:

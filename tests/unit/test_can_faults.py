@@ -147,13 +147,13 @@ def test_a_fault_on_can_does_not_affect_zenoh() -> None:
         for at_s, door in ((0.0, "can"), (0.2, "zenoh"))
     ]
     simulation = Simulation(parse_scene({**scene_document(SCENE), "commands": [], "faults": faults}))
-    servers, came = {door: MemoryServer() for door in ("zenoh", "can")}, dict[str, list[int]]()
+    servers, rows = {door: MemoryServer() for door in ("zenoh", "can")}, dict[str, list[int]]()
     for door, server in servers.items():
         MemoryClient(server).subscribe(
             sensor_key("probes"),
-            lambda _, payload, door=door: came.setdefault(door, []).append(decode_block(payload, SAMPLE_SCHEMA).index),
+            lambda _, payload, door=door: rows.setdefault(door, []).append(decode_block(payload, SAMPLE_SCHEMA).index),
         )
     Service(simulation, Fanout([*servers.values()], transports=servers), FreeRun(), block_ticks=10_000).run()
-    assert came == {"can": [*range(2000, 8000, 200)], "zenoh": [*range(0, 4000, 200), *range(6000, 8000, 200)]}
+    assert rows == {"can": [*range(2000, 8000, 200)], "zenoh": [*range(0, 4000, 200), *range(6000, 8000, 200)]}
     with pytest.raises(InputError, match="door must be one that this rig has: zenoh"):
         Service(Simulation(simulation.scene), MemoryServer(), FreeRun(), block_ticks=10_000)

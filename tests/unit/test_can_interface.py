@@ -366,13 +366,13 @@ def test_frames_sent_before_a_shutdown_reach_the_bus(rig: Rig) -> None:
 def test_many_small_steps_lose_nothing(rig: Rig) -> None:
     sender, receiver = rig.bus(), rig.bus()
     frames = codec.make_records([message(0x100, number.to_bytes(4, "big")) for number in range(20_000)])
-    taken: list[can.Message] = []
+    received: list[can.Message] = []
     for first in range(0, len(frames), 40):
         sender.send_records(frames[first : first + 40])
         while (item := receiver.recv(0)) is not None:
-            taken.append(item)
-    taken += read(receiver, len(frames) - len(taken))
-    assert [int.from_bytes(item.data, "big") for item in taken] == list(range(20_000))
+            received.append(item)
+    received += read(receiver, len(frames) - len(received))
+    assert [int.from_bytes(item.data, "big") for item in received] == list(range(20_000))
 
 
 def test_a_late_reader_loses_the_oldest_frames_with_a_report(rig: Rig) -> None:
@@ -792,9 +792,9 @@ def test_an_endpoint_without_a_token_is_removed(monkeypatch: pytest.MonkeyPatch)
 
 def test_numbers_of_nodes_are_not_reused_at_once() -> None:
     with Rig("process", "1M") as rig:
-        seen = set()
+        numbers = set()
         for _ in range(10):
             bus: Any = rig.bus()
-            seen.add(bus.node)
+            numbers.add(bus.node)
             bus.shutdown()
-        assert len(seen) == 10
+        assert len(numbers) == 10

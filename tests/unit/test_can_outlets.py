@@ -741,18 +741,18 @@ def test_messages_are_bounded_and_never_split_by_short_reads() -> None:
         messages = [b"<%d %s>" % (number, b"x" * (number % 700)) for number in range(400)]
         thread = threading.Thread(target=outlet.serve)
         thread.start()
-        kept, seen, turn = [], b"", random.Random(3)
+        kept, received, turn = [], b"", random.Random(3)
         for each in messages:
             if outlet.put(each):
                 kept.append(each)
             if turn.random() < 0.3:
                 with contextlib.suppress(BlockingIOError):
-                    seen += theirs.recv(turn.randrange(1, 600), socket.MSG_DONTWAIT)
+                    received += theirs.recv(turn.randrange(1, 600), socket.MSG_DONTWAIT)
         assert 50 <= len(kept) < 400
         theirs.settimeout(5.0)
-        while len(seen) < len(b"".join(kept)):
-            seen += theirs.recv(333)
-        assert seen == b"".join(kept)
+        while len(received) < len(b"".join(kept)):
+            received += theirs.recv(333)
+        assert received == b"".join(kept)
         theirs.sendall(b"<end>")
         assert theirs.recv(100) == b"<end>"
         theirs.close()
@@ -771,11 +771,11 @@ def test_each_write_contains_complete_messages() -> None:
             assert outlet.put(each)
         thread = threading.Thread(target=outlet.serve)
         thread.start()
-        seen: list[bytes] = []
-        while len(b"".join(seen)) < len(b"".join(messages)):
-            seen.append(theirs.recv(1 << 16))
-        assert all(each.startswith(b"< ") and each.endswith(b" >") and len(each) <= 1024 for each in seen)
-        assert b"".join(seen) == b"".join(messages)
+        writes: list[bytes] = []
+        while len(b"".join(writes)) < len(b"".join(messages)):
+            writes.append(theirs.recv(1 << 16))
+        assert all(each.startswith(b"< ") and each.endswith(b" >") and len(each) <= 1024 for each in writes)
+        assert b"".join(writes) == b"".join(messages)
         outlet.stop()
         thread.join(5.0)
 

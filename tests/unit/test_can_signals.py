@@ -246,8 +246,8 @@ def test_a_frame_has_the_values_of_its_kind(kind: CommandKind, values: dict[str,
 
 
 def test_only_an_advancing_counter_is_accepted() -> None:
-    taken = [last for last in range(256) if isinstance(parse_command(*HAMMER, last), Command)]
-    assert sorted((8 - last) % 256 for last in taken) == list(range(1, MAX_LEAD + 1))
+    accepted = [last for last in range(256) if isinstance(parse_command(*HAMMER, last), Command)]
+    assert sorted((8 - last) % 256 for last in accepted) == list(range(1, MAX_LEAD + 1))
     assert parse_command(*HAMMER, 8) is Result.STALE_COUNTER
 
 

@@ -51,11 +51,11 @@ def find_missing(name: str, entry: type[SceneCommand]) -> Iterator[str]:
     if not hasattr(entry, "CAN"):
         yield f"{where}: CAN = CanFrame(kind, event=...) is missing: no CAN kind and no CAN event"
     else:
-        taken = {other.CAN.event: key for key, other in COMMANDS.items() if key != name and hasattr(other, "CAN")}
-        taken |= {int(kind): kind.name.lower() for kind in EventKind if kind.name.lower() not in COMMANDS}
-        if entry.CAN.event in taken or not 0 < entry.CAN.event < 256:
-            free = next(number for number in range(1, 256) if number not in taken)
-            holder = f"taken by {taken[entry.CAN.event]}" if entry.CAN.event in taken else "not 1 to 255"
+        owner = {other.CAN.event: key for key, other in COMMANDS.items() if key != name and hasattr(other, "CAN")}
+        owner |= {int(kind): kind.name.lower() for kind in EventKind if kind.name.lower() not in COMMANDS}
+        if entry.CAN.event in owner or not 0 < entry.CAN.event < 256:
+            free = next(number for number in range(1, 256) if number not in owner)
+            holder = f"taken by {owner[entry.CAN.event]}" if entry.CAN.event in owner else "not 1 to 255"
             yield f"{where}: CAN event {entry.CAN.event} of {name} is {holder}; {free} is free"
         kinds = {
             key: other.CAN.kind for key, other in COMMANDS.items()
@@ -238,15 +238,15 @@ def test_the_console_has_each_command_with_the_fields_of_the_table(name: str) ->
     typed = {field: each for field, each in given.items() if field in quantities}
     assert name == "speed" or set(typed) in (set(quantities), set())  # speed calls its one field hz
     assert all(each.default == quantities[field].default for field, each in typed.items())
-    taken: list[tuple[str, bytes]] = []
+    requests: list[tuple[str, bytes]] = []
 
     class Rig:
         def request(self, key: str, payload: bytes, **_: Any) -> bytes:
-            taken.append((key, payload))
+            requests.append((key, payload))
             return b'{"accepted": true, "id": 1, "tick": 0, "time_s": 0.0}'
 
     Console(Rig()).send(name, **make_request(COMMANDS[name]))
-    assert taken[0][0] == f"rig/command/{name}"
+    assert requests[0][0] == f"rig/command/{name}"
 
 
 @pytest.mark.parametrize("name", MECHANICAL)

@@ -302,13 +302,13 @@ def test_a_rig_that_is_killed_ends_the_blocks() -> None:
 
 
 def test_a_function_is_called_with_each_block() -> None:
-    taken: list[Samples] = []
+    blocks: list[Samples] = []
     with on_memory(channels=CHANNELS) as (rig, daq):
-        daq.call(taken.append, rows=BLOCK)
+        daq.call(blocks.append, rows=BLOCK)
         rig.publish(*GROUPS, blocks=5)
         rig.end()
         assert daq.wait(timeout_s=10.0)
-    np.testing.assert_allclose(np.concatenate([each.values for each in taken]), expected(0, 5 * BLOCK), atol=1e-9)
+    np.testing.assert_allclose(np.concatenate([each.values for each in blocks]), expected(0, 5 * BLOCK), atol=1e-9)
 
 
 def test_an_exception_of_the_function_is_raised_again() -> None:

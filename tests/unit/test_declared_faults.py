@@ -227,12 +227,12 @@ def test_a_validation_uses_the_fault_events_of_blocks(kind: str, tmp_path: Path)
     known = validate(recording)
     assert known.bit_exact
     assert known.good
-    taken = kind in ("dropout", "lose-blocks")
-    assert (known.skipped > 0) == taken
+    removes_blocks = kind in ("dropout", "lose-blocks")
+    assert (known.skipped > 0) == removes_blocks
     blind = validate(recording, blind=True)
     assert bool(blind.doubts) == (kind != "late-blocks")
     assert blind.good == (not blind.doubts)
-    if taken:
+    if removes_blocks:
         assert blind.skipped == known.skipped
         assert f"{known.skipped} of 8000 rows of {PROBES} are missing" in blind.verdict_line
 

@@ -119,12 +119,12 @@ def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
     missing += [f"kind of fault {each.name()}: {each.__module__} has two classes of that name"
                 for each in classes if faults.KINDS.get(each.name(), each) is not each]  # fmt: skip
     numbers = [kind.number for kind in faults.KINDS.values()]
-    taken = dict(enumerate(fault_cases.NUMBERED, start=1))
-    free = next(number for number in range(len(taken) + 1, 256) if number not in numbers)
+    kinds_by_number = dict(enumerate(fault_cases.NUMBERED, start=1))
+    free = next(number for number in range(len(kinds_by_number) + 1, 256) if number not in numbers)
     for name, kind in faults.KINDS.items():
-        holder = taken.get(kind.number, name if numbers.count(kind.number) == 1 else "another kind")
+        holder = kinds_by_number.get(kind.number, name if numbers.count(kind.number) == 1 else "another kind")
         if holder != name or not 1 <= kind.number <= 255:
-            was = next((number for number, each in taken.items() if each == name), None)
+            was = next((number for number, each in kinds_by_number.items() if each == name), None)
             missing.append(
                 f"kind of fault {name}: {kind.__module__}: number={kind.number or 'none'} of class "
                 f"{kind.__name__} must be {was or f'one that no kind has or had; {free} is free'}"
@@ -155,14 +155,14 @@ def test_a_defect_is_injected_sized_and_recognised_or_has_a_reason() -> None:
         node for path in (ROOT / "replays/recordings/validation/explanations").glob("*.py")
         for node in ast.walk(ast.parse(path.read_text()))
     ]  # fmt: skip
-    said = {each for node in calls if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    words = {each for node in calls if isinstance(node, ast.Constant) and isinstance(node.value, str)
             for text in (node.value, node.value.split()[-1:] and node.value.split()[-1])
             for each in alternatives(str(text))}  # fmt: skip
     missing = []
     for name, row in DEFECTS.items():
         where = f"defect {name}: {DEFECT_TABLE}"
         names = row.validation or [name]
-        readers = {"validation": row.doubts or said & {name, *names}, "score": row.score or row.digital}
+        readers = {"validation": row.doubts or words & {name, *names}, "score": row.score or row.digital}
         for reader, recognises in readers.items():
             if not recognises and reader not in row.undetected:
                 missing.append(
@@ -210,11 +210,11 @@ def test_a_file_format_has_a_row_and_a_reader() -> None:
             missing.append(f"{where} needs a class {form.writer} derived from FormatWriter")
         elif form.writer and writer.write is FormatWriter.write:
             missing.append(f"{where}: {form.writer} needs write")
-        for place, said, endings in (
+        for place, text, endings in (
             ("IMPORTED in rig/cli/commands/import_.py", IMPORTED, form.suffixes),
             ("EXPORTED in rig/cli/commands/export.py", EXPORTED, form.suffixes[:1] if form.writer else ()),
         ):
-            lacking = [each for each in endings if each not in re.findall(r"\.\w+", said)]
+            lacking = [each for each in endings if each not in re.findall(r"\.\w+", text)]
             missing += [f"file format {name}: {place} must name {each}" for each in lacking]
     used = {form.module for form in FORMATS.values()}
     for path in (ROOT / readers).glob("*.py"):

@@ -110,11 +110,11 @@ def test_the_top_of_a_parabola_is_between_samples() -> None:
 def test_two_tones_are_found_by_their_frequencies() -> None:
     n = np.arange(4000) - 1999.5
     values = np.cos(2.0 * math.pi * 0.05 * n) + 0.3 * np.sin(2.0 * math.pi * 0.0713 * n) + 0.1
-    turns, parts, matrix, left = fit_tones(n, values, np.array([0.05001, 0.07129]), 1e-12)
+    turns, parts, matrix, residual = fit_tones(n, values, np.array([0.05001, 0.07129]), 1e-12)
     assert turns == pytest.approx([0.05, 0.0713], abs=1e-12)
     assert parts == pytest.approx([1.0, 0.0, 0.0, 0.3, 0.1], abs=1e-9)
     assert matrix.shape == (4000, 7)
-    assert np.abs(left).max() < 1e-9
+    assert np.abs(residual).max() < 1e-9
 
 
 def test_runs_pieces_and_blocks_of_rows() -> None:

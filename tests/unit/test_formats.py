@@ -77,7 +77,7 @@ def gappy(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Rec
 def noted(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The probes of the same, with a manual command and a note, as a running rig reports them."""
     path = tmp_path_factory.mktemp("noted") / "noted.mcap"
-    told = [
+    events = [
         *recording.events[:-1],
         {"event": "command", "tick": 50_000, "time_s": 0.05, "id": 1, "command": "speed", "from": "a console",
          "request": {"speed_hz": 5.2}},
@@ -90,7 +90,7 @@ def noted(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Rec
     ) as writer:
         for _, payload in recording.payloads(sensor_key("probes")):
             writer.write(sensor_key("probes"), payload, 0)
-        for event in told:
+        for event in events:
             writer.write(EVENTS, encode_document(event), 0)
     return Recording.open(path)
 

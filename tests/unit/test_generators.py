@@ -179,12 +179,12 @@ def test_the_residual_is_the_noise_of_the_sensor() -> None:
     quiet = load_scene("test-sine", {"duration_s": 1.0, "sensors.noise": False})
     loud, still = (Simulation(each).advance(1_000_000).samples["probes"].values for each in (scene, quiet))
     channels = scene.table.groups["probes"].channels
-    left = (loud - still) * np.array([channel.lsb_v for channel in channels])
+    residual = (loud - still) * np.array([channel.lsb_v for channel in channels])
     for c, channel in enumerate(channels):
         bits = np.random.SFC64(0)
         bits.state = {**bits.state, "state": {"state": noise_streams([channel.name], scene.seed)[0]}}
-        drawn = channel.noise_v * np.random.Generator(bits).standard_normal(len(left))
-        assert np.abs(left[:, c] - drawn).max() <= 1.001 * channel.lsb_v
+        drawn = channel.noise_v * np.random.Generator(bits).standard_normal(len(residual))
+        assert np.abs(residual[:, c] - drawn).max() <= 1.001 * channel.lsb_v
 
 
 def test_amplitude_in_units_uses_the_channels_calibration() -> None:

@@ -183,10 +183,10 @@ def test_noise_reduced_by_resampling_is_not_reported(method: str, gain: float, t
     text = f"[resample]\nmethod = '{method}'\nrate_hz = 10000\n[channels.disk_x]\nsource = 'd'\n"
     conversion, recording = imported(path, text, tmp_path)
     samples = recording.samples("probes")
-    left = samples["disk_x"][200:-200] - np.sin(40 * samples.times_s[200:-200])
+    residual = samples["disk_x"][200:-200] - np.sin(40 * samples.times_s[200:-200])
     noise_v = recording.table.channels["disk_x"].noise_v
-    assert float(left.std()) == pytest.approx(gain * 0.003, rel=0.02)
-    assert noise_v == pytest.approx(float(left.std()), rel=0.04)
+    assert float(residual.std()) == pytest.approx(gain * 0.003, rel=0.02)
+    assert noise_v == pytest.approx(float(residual.std()), rel=0.04)
     said_gain = float(conversion.channels[0].time.split("; noise ")[1].split(" ")[0])
     assert said_gain == pytest.approx(gain, rel=0.01)
 
@@ -216,8 +216,8 @@ def test_a_detected_corner_is_proposed_for_confirmation(tmp_path: Path) -> None:
     rate, several, path = 20_000, 8, tmp_path / "x.csv"
     generator = np.random.default_rng(2)
     wide = generator.standard_normal((20_000 * several, 2))
-    heard = behind_a_low_pass(wide, 4000.0, rate * several)[::several]
-    rows = np.column_stack([np.arange(len(heard)) / rate, heard])
+    filtered = behind_a_low_pass(wide, 4000.0, rate * several)[::several]
+    rows = np.column_stack([np.arange(len(filtered)) / rate, filtered])
     np.savetxt(path, rows, delimiter=",", header="time,inner_x [m/s^2],inner_y [m/s^2]", comments="", fmt="%.9f")
     text, _ = guess_mapping([path])
     questions = [line for line in text.splitlines() if CHECK in line]

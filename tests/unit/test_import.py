@@ -592,10 +592,10 @@ def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
         found, expected = probes[name], motion[at]
         # The mean of an imported signal is assumed to be zero.
         assert np.ptp((found - expected)[inside]) < 1e-6
-    house = recording.samples("accelerations")
+    accelerations = recording.samples("accelerations")
     # Samples that need no shift stay unchanged, at times in whole microseconds.
-    acceleration = 30.0 * np.sin(400 * (house.times_s + zero_s))  # m/s^2
-    np.testing.assert_allclose(house["inner_x"], acceleration, rtol=0, atol=30 * 400 * 0.6e-6)
+    acceleration = 30.0 * np.sin(400 * (accelerations.times_s + zero_s))  # m/s^2
+    np.testing.assert_allclose(accelerations["inner_x"], acceleration, rtol=0, atol=30 * 400 * 0.6e-6)
     force = recording.samples("forces")
     np.testing.assert_allclose(
         force["P_E"][inside], 50.0 * np.sin(100 * (force.times_s + zero_s))[inside], rtol=0, atol=1e-4

@@ -236,8 +236,8 @@ def test_unpredicted_pulses_are_no_fault(motion: second_rig.Motion, tmp_path: Pa
     columns = {"time": own_s[: (own_s > 0.63).sum()], **{name: values[name][own_s > 0.63] for name in few}}
     keyphasor, *channels = WHOLE.replace("5000", "4000").split("[channels.")
     mapping = "".join(f"[channels.{one}" for one in channels if one.partition("]")[0] in few)
-    (told := tmp_path / "told").mkdir()
-    recording = import_log(told, columns, keyphasor + mapping)
+    (folder := tmp_path / "told").mkdir()
+    recording = import_log(folder, columns, keyphasor + mapping)
     begin, (before, *_) = Experiment.from_recording(recording).begin, recording.edges()
     assert begin is not None
     assert math.remainder(begin.angle + 2.0 * math.pi * 6.2 * before, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-3)

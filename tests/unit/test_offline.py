@@ -38,9 +38,9 @@ def run(shown: dict[str, Any]) -> Run:
 
 def test_the_lines_of_the_docstring_work(shown: dict[str, Any]) -> None:
     run = shown["run"]
-    (true, true_unit), (seen, seen_unit), (disk_x, times_s) = shown["shown"]
-    assert (true_unit, seen_unit) == ("m", "mm")
-    assert true * 1e3 == pytest.approx(seen, abs=0.02)
+    (true, true_unit), (measured, measured_unit), (disk_x, times_s) = shown["shown"]
+    assert (true_unit, measured_unit) == ("m", "mm")
+    assert true * 1e3 == pytest.approx(measured, abs=0.02)
     assert 500.0 < run["normal_force"].max() < 20_000.0, "it was hit and touched the ring"
     assert disk_x.max() == pytest.approx(true, abs=2e-5)
     assert disk_x.shape == times_s.shape == (40_000,)

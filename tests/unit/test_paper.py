@@ -41,13 +41,13 @@ ASSUMPTIONS = {"hammer.duration", "hammer.at", "transducer.bandwidth"}
 
 
 @pytest.fixture(scope="module")
-def told() -> list[str]:
+def progress() -> list[str]:
     return []
 
 
 @pytest.fixture(scope="module")
-def findings(told: list[str]) -> Findings:
-    return find(quick=True, processes=1, progress=told.append)
+def findings(progress: list[str]) -> Findings:
+    return find(quick=True, processes=1, progress=progress.append)
 
 
 def statement(**fields: object) -> Statement:
@@ -181,8 +181,8 @@ def test_rank_correlation():
     assert rank_correlation(parts, values) == pytest.approx([1.0, -0.8])
 
 
-def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list[str]):
-    assert len(told) == steps(quick=True)
+def test_quick_variant_has_a_number_on_every_line(findings: Findings, progress: list[str]):
+    assert len(progress) == steps(quick=True)
     for line in findings.lines:
         assert set(line.values) == set(SETS)
     for line in [*findings.lines, *findings.claims]:
@@ -196,7 +196,7 @@ def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list
     assert spread["orbit_ring"] == 2 * spread["orbit_disk"], "in the ring or at the disk"
     claims_of = {line.statement.quantity: line.values["corrected"] for line in findings.claims}
     few = len(findings.results["spread rigid"])
-    assert len(claims_of["stiff_force"]) == 3 * 3 * few > 9, "three houses and three readings of each sample"
+    assert len(claims_of["stiff_force"]) == 3 * 3 * few > 9, "three housings and three readings of each sample"
     assert len(claims_of["house_raises"]) == few
     assert spread["drop_amplified"] == 2 * spread["drop_reaction"] > 2, "two readings of each sample"
     assert all(len(findings.results[name]) == len(group) for name, group in list_groups(quick=True).items())
@@ -254,9 +254,9 @@ def test_report_backs_every_section_with_a_table(report: Report, tmp_path: Path)
 @pytest.mark.wallclock
 def test_two_processes_give_the_result_of_one():
     pulses = [Pulse(label=str(force), force_n=force, duration_s=0.3) for force in (20.0, 80.0, 100.0, 120.0)]
-    told: list[str] = []
-    assert str(list(outcomes(pulses, processes=2, progress=told.append))) == str(list(outcomes(pulses, processes=1)))
-    assert told == [pulse.label for pulse in pulses]
+    labels: list[str] = []
+    assert str(list(outcomes(pulses, processes=2, progress=labels.append))) == str(list(outcomes(pulses, processes=1)))
+    assert labels == [pulse.label for pulse in pulses]
 
 
 _POOL = """

@@ -34,7 +34,7 @@ def solve(name: str, given: Problem, tolerance: float, **options):
 
 
 def states_in_contact(given: Problem, *, count: int) -> np.ndarray:
-    """Return states around the ring, shape (count, 14); the houses move less than a transducer's preload."""
+    """Return states around the ring, shape (count, 14); the housings move less than a transducer's preload."""
     rng = np.random.default_rng(1)
     spread = STATE_SCALE * [0.05, 0.0, 1.0, 0.3, 0.3, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     y = given.y0 + rng.normal(size=(count, 14)) * spread

@@ -250,11 +250,11 @@ def test_a_cut_off_file_can_be_sought_in(folder: Path, path: Path) -> None:
     short = folder / "killed.mcap"
     data = path.read_bytes()
     short.write_bytes(data[: int(0.97 * len(data))])
-    with running(Track([short]), paused=True) as (_, heard, console):
+    with running(Track([short]), paused=True) as (_, client_log, console):
         for position_s in (0.4, 0.1, 0.5):
             console.seek(position_s)
             console.step_blocks(1)
-    assert [block.index for block in heard.blocks()] == [200 * number for number in (40, 10, 50)]
+    assert [block.index for block in client_log.blocks()] == [200 * number for number in (40, 10, 50)]
 
 
 # Parts, passes, numbers.
@@ -419,11 +419,11 @@ def running(track: Track, **options: Any) -> Iterator[tuple[Player, Received, Co
 
 
 def test_commands_of_a_rig_are_refused(track: Track) -> None:
-    with running(track, paused=True) as (_, heard, console):
+    with running(track, paused=True) as (_, client_log, console):
         for command in (console.hammer, console.release, lambda: console.speed(5.0)):
             with pytest.raises(RefusedError, match="a replay does not accept"):
                 command()
-        assert heard.all == []
+        assert client_log.all == []
 
 
 def test_a_simulator_refuses_the_commands_of_a_replay() -> None:
@@ -437,49 +437,49 @@ def test_a_simulator_refuses_the_commands_of_a_replay() -> None:
 
 
 def test_steps_while_paused(track: Track) -> None:
-    with running(track, paused=True) as (player, heard, console):
+    with running(track, paused=True) as (player, client_log, console):
         assert console.step_blocks(2).time_s == pytest.approx(0.02)
-        assert len(heard.blocks()) == 2
+        assert len(client_log.blocks()) == 2
         assert console.step(25_000).time_s == pytest.approx(0.04), "the last whole block"
-        assert len(heard.blocks()) == 4
+        assert len(client_log.blocks()) == 4
         console.step(5_000)
-        assert len(heard.blocks()) == 5
+        assert len(client_log.blocks()) == 5
         assert player.status()["replay"]["paused"] is True
         for fields in ({"ticks": 0}, {"ticks": 1.5}, {"blocks": True}, {}, {"ticks": 1, "blocks": 1}, {"x": 1}):
             request = json.dumps(fields).encode()
-            assert b'"accepted":false' in heard.client.request(wire.command_key("step"), request)
+            assert b'"accepted":false' in client_log.client.request(wire.command_key("step"), request)
 
 
 def test_playback_continues_after_a_seek(track: Track) -> None:
-    with running(track, paused=True) as (_, heard, console):
+    with running(track, paused=True) as (_, client_log, console):
         console.step_blocks(1)
         assert console.seek(0.4).time_s == pytest.approx(0.4)
         console.step_blocks(1)
         assert console.seek(0.1).time_s == pytest.approx(0.1)
         console.step_blocks(1)
-        assert [block.index for block in heard.blocks()] == [0, 40 * 200, 10 * 200]
+        assert [block.index for block in client_log.blocks()] == [0, 40 * 200, 10 * 200]
         for wrong in (-0.1, 0.6, 7.0):
             with pytest.raises(RefusedError, match=r"time_s must be a position from 0 to below 0\.6 s"):
                 console.seek(wrong)
-    assert heard.summary["played_s"] == pytest.approx(0.03), "what was jumped over was not played"
+    assert client_log.summary["played_s"] == pytest.approx(0.03), "what was jumped over was not played"
 
 
 def test_a_seek_with_new_numbers_leaves_no_gap(track: Track) -> None:
-    with running(track, paused=True, renumber=True) as (_, heard, console):
+    with running(track, paused=True, renumber=True) as (_, client_log, console):
         for position_s in (0.4, 0.1, 0.5):
             console.step_blocks(3)
             console.seek(position_s)
         console.step_blocks(1)
-        blocks = heard.blocks()
+        blocks = client_log.blocks()
         assert [block.index for block in blocks] == [200 * number for number in range(10)]
         assert [block.tick for block in blocks] == [10_000 * number for number in range(10)]
 
 
 def test_pause_resume_rate_and_the_end(track: Track) -> None:
-    with running(track, rate=0.01) as (player, heard, console):
+    with running(track, rate=0.01) as (player, client_log, console):
         console.pause()
         assert console.pause().command == "pause", "twice is no error"
-        held = len(heard.all)
+        held = len(client_log.all)
         assert player.status()["replay"]["paused"] is True
         console.resume()
         with pytest.raises(RefusedError, match="step must be sent to a paused replay"):
@@ -487,59 +487,59 @@ def test_pause_resume_rate_and_the_end(track: Track) -> None:
         with pytest.raises(RefusedError, match=r"rate must be a number of 0\.01 to 1000"):
             console.rate(0.0)
         console.rate(1000.0)
-        until(lambda: bool(heard.events) and heard.events[-1]["event"] == "end")
-        assert len(heard.all) > held
-        assert heard.payloads == group_by_key(generate_stream(BLOCKS))
+        until(lambda: bool(client_log.events) and client_log.events[-1]["event"] == "end")
+        assert len(client_log.all) > held
+        assert client_log.payloads == group_by_key(generate_stream(BLOCKS))
 
 
 def test_a_stop_ends_the_stream_well(track: Track) -> None:
-    with running(track, paused=True) as (_, heard, console):
+    with running(track, paused=True) as (_, client_log, console):
         console.step_blocks(3)
         console.stop()
-        until(lambda: heard.events[-1]["event"] == "end")
-    assert heard.events[-1]["reason"] == "stopped"
-    assert heard.events[-1]["rows"][PROBES] == 600
+        until(lambda: client_log.events[-1]["event"] == "end")
+    assert client_log.events[-1]["reason"] == "stopped"
+    assert client_log.events[-1]["rows"][PROBES] == 600
 
 
 def test_a_burst_waits_for_the_clients_reports(track: Track, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(player_module, "_MAX_AHEAD_BLOCKS", 10)
-    with running(track, clock=FreeRun(), paused=True) as (_, heard, console):
-        client = heard.client
+    with running(track, clock=FreeRun(), paused=True) as (_, client_log, console):
+        client = client_log.client
         client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 0}')
         console.resume()
-        until(lambda: len(heard.blocks()) >= 11)
+        until(lambda: len(client_log.blocks()) >= 11)
         client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 1000}')
-        assert len(heard.blocks()) == 11, "ten blocks ahead, and the one that made it so"
-        until(lambda: len(heard.blocks()) >= 16)
-        assert len(heard.blocks()) == 16
+        assert len(client_log.blocks()) == 11, "ten blocks ahead, and the one that made it so"
+        until(lambda: len(client_log.blocks()) >= 16)
+        assert len(client_log.blocks()) == 16
         client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 1000, "done": true}')
-        until(lambda: len(heard.blocks()) == BLOCKS)
+        until(lambda: len(client_log.blocks()) == BLOCKS)
 
 
 def test_playback_starts_when_all_expected_clients_are_connected(track: Track) -> None:
-    with running(track, clock=FreeRun(), wait_for=2) as (player, heard, console):
+    with running(track, clock=FreeRun(), wait_for=2) as (player, client_log, console):
         play = player.status()["replay"]
         assert (play["waiting_for"], play["paused"]) == (2, True)
-        heard.client.report(f"{wire.CLIENTS}/a", b'{"received_index": null}')
+        client_log.client.report(f"{wire.CLIENTS}/a", b'{"received_index": null}')
         console.step_blocks(2)
-        assert len(heard.blocks()) == 2, "one is not enough; it may be stepped and sought in"
+        assert len(client_log.blocks()) == 2, "one is not enough; it may be stepped and sought in"
         console.seek(0.0)
-        heard.client.report(f"{wire.CLIENTS}/b", b'{"received_index": null}')
-        until(lambda: bool(heard.events) and heard.events[-1]["event"] == "end")
+        client_log.client.report(f"{wire.CLIENTS}/b", b'{"received_index": null}')
+        until(lambda: bool(client_log.events) and client_log.events[-1]["event"] == "end")
         assert player.status()["replay"]["waiting_for"] == 0
-        assert len(heard.blocks()) == 2 + BLOCKS
+        assert len(client_log.blocks()) == 2 + BLOCKS
 
 
 @pytest.mark.parametrize("ends", ["resume", "pause", "stop"])
 def test_waiting_is_ended_by_commands(track: Track, ends: str) -> None:
-    with running(track, rate=0.01, wait_for=1) as (player, heard, console):
+    with running(track, rate=0.01, wait_for=1) as (player, client_log, console):
         getattr(console, ends)()
         assert player.status()["replay"]["paused"] is (ends != "resume")
         if ends != "stop":
             assert player.status()["replay"]["waiting_for"] == 0
-            heard.client.report(f"{wire.CLIENTS}/a", b'{"received_index": null}')
-    assert heard.events[-1]["reason"] == "stopped"
-    assert heard.blocks() == []
+            client_log.client.report(f"{wire.CLIENTS}/a", b'{"received_index": null}')
+    assert client_log.events[-1]["reason"] == "stopped"
+    assert client_log.blocks() == []
 
 
 def test_the_wait_for_clients_is_limited(track: Track) -> None:
@@ -555,11 +555,11 @@ def test_the_scene_contains_earlier_commands_for_late_clients(folder: Path) -> N
     payloads = list(generate_stream(BLOCKS))
     payloads.insert(len(payloads) // 2, (wire.EVENTS, wire.encode_document(command)))
     track = Track([write_recording(folder / "command.mcap", payloads)])
-    with running(track, paused=True) as (_, heard, console):
-        for position_s, taken in ((0.1, []), (0.3, [{name: command[name] for name in track.commands[0]}])):
+    with running(track, paused=True) as (_, client_log, console):
+        for position_s, commands in ((0.1, []), (0.3, [{name: command[name] for name in track.commands[0]}])):
             console.seek(position_s)
-            scene = wire.decode_document(heard.client.request(wire.SCENE))
-            assert scene.get("taken", []) == taken
+            scene = wire.decode_document(client_log.client.request(wire.SCENE))
+            assert scene.get("taken", []) == commands
 
 
 # Dependencies.

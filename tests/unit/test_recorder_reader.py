@@ -279,7 +279,7 @@ def test_unreadable_files_are_refused(tmp_path, name):
 def test_opening_an_unfinished_recording_names_its_part_file(tmp_path):
     for name in ("a.mcap.part", "run.0000.mcap", "run.mcap.part", "run.toml"):
         (tmp_path / name).touch()
-    for asked, named in (("a.mcap", "a.mcap.part"), ("run.mcap", f"run.0000.mcap, {tmp_path}/run.mcap.part")):
+    for file, named in (("a.mcap", "a.mcap.part"), ("run.mcap", f"run.0000.mcap, {tmp_path}/run.mcap.part")):
         with pytest.raises(InputError) as caught:
-            Recording.open(tmp_path / asked)
+            Recording.open(tmp_path / file)
         assert caught.value.must == f"a file that can be read, such as {tmp_path}/{named}"

@@ -145,10 +145,10 @@ def test_a_part_contains_earlier_commands(tmp_path, items):
     }
     file = series(tmp_path / "run.mcap", rotate_s=0.3)
     write(file, [*items[:100], (EVENTS, encode_document(command)), *items[100:]])
-    taken = {"id": 3, "tick": 100_000, "command": "hammer", "request": {"force_n": 50.0}}
+    earlier = {"id": 3, "tick": 100_000, "command": "hammer", "request": {"force_n": 50.0}}
     scenes = [Recording.open(part).scene for part in file.files]
     assert "taken" not in scenes[0]
-    assert [scene["taken"] for scene in scenes[1:]] == [[taken]] * 3
+    assert [scene["taken"] for scene in scenes[1:]] == [[earlier]] * 3
 
 
 def test_rows_lost_at_a_seam_are_a_gap(tmp_path):
@@ -230,8 +230,8 @@ def test_the_oldest_files_are_deleted_on_a_full_disk(tmp_path, monkeypatch):
     disk_bytes = 8_000_000
 
     def statvfs(_: object) -> SimpleNamespace:
-        taken = sum(file.stat().st_size for file in tmp_path.iterdir())
-        return SimpleNamespace(f_bavail=disk_bytes - taken, f_frsize=1)
+        used = sum(file.stat().st_size for file in tmp_path.iterdir())
+        return SimpleNamespace(f_bavail=disk_bytes - used, f_frsize=1)
 
     monkeypatch.setattr(os, "statvfs", statvfs)
     file = series(tmp_path / "run.mcap", rotate_mb=1.0, keep_free_mb=0.0, when_full="remove-oldest")

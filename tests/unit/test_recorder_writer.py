@@ -121,7 +121,7 @@ def test_channel_metadata_turns_counts_into_units(path):
 def test_plots_are_labelled_and_show_the_samples(path):
     recording = Recording.open(path)
     table = default_table()
-    seen = set()
+    names = set()
     for topic in (topic for topic in recording.messages if topic.startswith("view/") and topic != "view/events"):
         messages = [message for _, message in decode_topic(path, topic)]
         assert len(messages) == 0.4 * 500
@@ -140,8 +140,8 @@ def test_plots_are_labelled_and_show_the_samples(path):
             for other in arrays:
                 if other != slot and arrays[other].size:
                     assert np.isnan(arrays[other][:, column]).all()
-            seen.add(channel.name)
-    assert seen == set(table.channels)
+            names.add(channel.name)
+    assert names == set(table.channels)
 
 
 def test_the_number_of_plots_fits_a_viewer_with_eight():
@@ -328,14 +328,14 @@ def test_unknown_streams_are_recorded(tmp_path):
 def test_nothing_is_overwritten_without_force(tmp_path, items):
     path = tmp_path / "run.mcap"
     part = tmp_path / "run.mcap.part"
-    for taken in (path, part):
-        taken.write_text("precious")
+    for existing in (path, part):
+        existing.write_text("precious")
         with pytest.raises(InputError, match="a new file"):
             check_destination(path)
         with pytest.raises(InputError, match="a new file"):
             writer(path)
-        assert taken.read_text() == "precious"
-        taken.unlink()
+        assert existing.read_text() == "precious"
+        existing.unlink()
     path.write_text("precious")
     part.write_text("left over")
     write(path, items, force=True)
@@ -476,11 +476,11 @@ def test_a_recording_in_the_making_is_not_replaced(tmp_path, items):
 
 def test_the_remainder_of_a_killed_recording_is_replaced(tmp_path, items):
     path = tmp_path / "run.mcap"
-    left = path.with_name(path.name + ".part")
-    left.write_bytes(b"what a kill left")
+    remainder = path.with_name(path.name + ".part")
+    remainder.write_bytes(b"what a kill left")
     write(path, items, force=True)
     assert Recording.open(path).complete
-    assert not left.exists()
+    assert not remainder.exists()
 
 
 @pytest.mark.filterwarnings("ignore:.*mcap_ros1.reader:DeprecationWarning")  # its users still import it

@@ -104,8 +104,8 @@ def test_returned_rows_are_read_next() -> None:
     reader = RowReader("a reader")
     for samples in (part(0, 10), part(10, 10)):
         reader.add(samples)
-    taken = reader.read(15)
-    reader.put_back(taken.rows(5, 15))
+    rows = reader.read(15)
+    reader.put_back(rows.rows(5, 15))
     assert [(each.index, len(each)) for each in (reader.read(10), reader.read())] == [(5, 10), (15, 5)]
 
 

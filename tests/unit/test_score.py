@@ -267,11 +267,11 @@ def test_fifteen_channels_are_mapped_by_two_seconds_of_chips() -> None:
     order = generator.permutation(15)
     order[3] = order[7]  # one is recorded twice
     signs = generator.choice([-1, 1], 15)
-    taken = {
+    recorded = {
         f"ai{n}": (signs[n] * sent[names[k]][0][2000:42_000] + 0.3 * generator.standard_normal(40_000), 20e3)
         for n, k in enumerate(order)
     }
-    wires = find_wires(taken, sent)
+    wires = find_wires(recorded, sent)
     assert [wire.channel for wire in wires.values()] == [names[k] for k in order]
     assert [wire.polarity for wire in wires.values()] == signs.tolist()
     assert {wire.rivals for wire in wires.values()} == {()}

@@ -106,13 +106,13 @@ def group_kinds(most: int) -> list[tuple[str, ...]]:
     """Return sets of at most `most` kinds, no two of which are on one channel."""
     sets: list[tuple[str, ...]] = []
     for kind in SCORED:
-        taken = [
+        candidates = [
             n
             for n, each in enumerate(sets)
             if len(each) < most and names_of(kind).isdisjoint(set().union(*map(names_of, each)))
         ]
-        if taken:
-            sets[taken[0]] += (kind,)
+        if candidates:
+            sets[candidates[0]] += (kind,)
         else:
             sets.append((kind,))
     return sets

@@ -122,9 +122,9 @@ def test_the_interval_of_stamp_jitter_follows_chi_squared() -> None:
     ends = [value * math.sqrt(dof / chi2.ppf(p, dof)) for p in (0.975, 0.025)]
     assert (low, high) == pytest.approx(ends, rel=2e-3)
     for name, true in (("stamp offset", 0.25), ("stamp rate", 50.0)):
-        told = found[name]
-        assert told is not None
-        assert told[1] < true < told[2]
+        interval = found[name]
+        assert interval is not None
+        assert interval[1] < true < interval[2]
 
 
 @pytest.mark.parametrize("noise", ["white", "ar10", "ar100", "sine"])

@@ -155,12 +155,12 @@ def full(_: Deliverer, monkeypatch: pytest.MonkeyPatch) -> None:
     [(nobody, ConnectionError, "no reply"), (silent, InputError, "in 0.1 s"), (full, RefusedError, "No space left")],
 )
 def test_errors_during_a_live_run_are_reported(
-    how: Callable[[Deliverer, pytest.MonkeyPatch], None], kind: type[Exception], told: str, tmp_path: Path,
+    how: Callable[[Deliverer, pytest.MonkeyPatch], None], kind: type[Exception], message: str, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     daq = Deliverer(blocks=5)
     how(daq, monkeypatch)
-    with pytest.raises(kind, match=told):
+    with pytest.raises(kind, match=message):
         daq.collect(tmp_path)
 
 

@@ -171,8 +171,8 @@ def test_errors_of_a_slow_reference_are_not_crosstalk(hz: float, amplitude: floa
     angle = 2.0 * np.pi * hz * t
     own = amplitude * np.sin(angle)
     other = own + 0.3 * amplitude * np.sin(1.7 * angle + 0.4)
-    left = detrend(other, bp=np.linspace(0, len(t), 65).astype(int)[1:-1])
-    error = 0.2 * size * left / np.std(left)
+    rest = detrend(other, bp=np.linspace(0, len(t), 65).astype(int)[1:-1])
+    error = 0.2 * size * rest / np.std(rest)
     known, nothing = own + error, np.empty((0, len(t)))
     residual = size * np.random.default_rng(1).standard_normal(len(t)) - error
     part = find_crosstalk(residual, [known, np.gradient(known)], [other], size, nothing)[1]

@@ -397,7 +397,7 @@ def test_an_inverted_record_fails_if_its_polarity_is_determined(
     """A sine is inverted half a period later, which leaves its polarity open; a bias does not."""
     sent = Sessions(tmp_path / "sessions").get(kind, first_s=61.0)
     volts = Converter(61.2, 8000).volts(sent, np.random.default_rng(9))
-    columns = {name: (told, -values) for name, (told, values) in make_columns(sent, volts, unit).items()}
+    columns = {name: (stamps, -values) for name, (stamps, values) in make_columns(sent, volts, unit).items()}
     file = write_values("parquet", tmp_path / "daq", columns, np.arange(len(volts)) / RATE_HZ, RATE_HZ)
     card = judge(file, [sent.path], path="analogue")
     assert card.outcome == outcome, card.verdict_line
@@ -448,8 +448,8 @@ def test_exchanged_signals_a_quarter_turn_apart_are_detected() -> None:
     t = np.arange(20_000) / RATE_HZ
     signals = {"disk_x": np.cos, "disk_y": np.sin, "ring_x": np.cos, "ring_y": np.sin}
     sent = {name: (signal(2.0 * np.pi * 27.0 * t), 20e3) for name, signal in signals.items()}
-    taken = {name: (values[3000:13_000], hz) for name, (values, hz) in sent.items()}
-    wires = find_wires(taken | {"ring_x": taken["ring_y"], "ring_y": taken["ring_x"]}, sent)
+    recorded = {name: (values[3000:13_000], hz) for name, (values, hz) in sent.items()}
+    wires = find_wires(recorded | {"ring_x": recorded["ring_y"], "ring_y": recorded["ring_x"]}, sent)
     assert {name: wire.channel for name, wire in wires.items()} == {
         "disk_x": "disk_x", "disk_y": "disk_y", "ring_x": "ring_y", "ring_y": "ring_x",
     }  # fmt: skip

@@ -53,9 +53,9 @@ def test_a_constant_signal_is_shown_within_half_a_step(channel, part: float) -> 
     low, high = channel.range_v
     volts = 0.5 * (low + high) + part * 0.5 * (high - low)
     value = (volts - channel.bias_v) / channel.sensitivity_v
-    seen = compute_values(channel.name, np.full(40, value * channel.si))
+    values = compute_values(channel.name, np.full(40, value * channel.si))
     # Half a step of the converter, and the rounding of a filter that runs on volts.
-    assert np.abs(seen - value).max() <= 0.5 * abs(channel.scale) * (1.0 + 1e-6)
+    assert np.abs(values - value).max() <= 0.5 * abs(channel.scale) * (1.0 + 1e-6)
 
 
 @pytest.mark.parametrize("channel", DC, ids=lambda channel: channel.name)
@@ -63,8 +63,8 @@ def test_output_is_limited_to_the_range_of_the_conditioner(channel) -> None:
     for volts, limit in zip((-1e3, 1e3), channel.range_v, strict=True):
         value = (volts - channel.bias_v) / channel.sensitivity_v
         expected = (limit - channel.bias_v) / channel.sensitivity_v
-        seen = compute_values(channel.name, np.full(40, value * channel.si))
-        np.testing.assert_allclose(seen, expected, rtol=0, atol=abs(channel.scale))
+        values = compute_values(channel.name, np.full(40, value * channel.si))
+        np.testing.assert_allclose(values, expected, rtol=0, atol=abs(channel.scale))
 
 
 def test_counts_are_limited_by_the_converter() -> None:
@@ -199,11 +199,11 @@ def measure_response(channel: Channel, frequency_hz: float, *, seconds: float) -
     amplitude = 0.4 * min(channel.range_v[1] - channel.bias_v, channel.bias_v - channel.range_v[0])
     amplitude *= channel.si / abs(channel.sensitivity_v)
     rows = rows_of(channel.signal, amplitude * np.sin(2 * math.pi * frequency_hz * times))
-    seen = group.engineering(compute_counts(group, rows, noise=False))[:, 0] * channel.si / amplitude
-    at = 2 * math.pi * frequency_hz * np.arange(len(seen)) / channel.rate_hz
-    half = slice(len(seen) // 2, None)
+    response = group.engineering(compute_counts(group, rows, noise=False))[:, 0] * channel.si / amplitude
+    at = 2 * math.pi * frequency_hz * np.arange(len(response)) / channel.rate_hz
+    half = slice(len(response) // 2, None)
     waves = np.stack([np.sin(at), np.cos(at), np.ones_like(at)])
-    sine, cosine, _ = np.linalg.lstsq(waves[:, half].T, seen[half], rcond=None)[0]
+    sine, cosine, _ = np.linalg.lstsq(waves[:, half].T, response[half], rcond=None)[0]
     return complex(sine, cosine)
 
 
@@ -229,11 +229,11 @@ def test_a_ramp_is_delayed_by_the_filter(rate_hz: int) -> None:
     channel = default_table().channels["disk_x"].model_copy(update={"rate_hz": rate_hz})
     group = group_of("probes").model_copy(update={"channels": (channel,), "rate_hz": rate_hz})
     times = np.arange(800) / ROW_RATE
-    seen = group.engineering(compute_counts(group, rows_of("disk_x", 0.05 * times), noise=False))[:, 0] * 1e-3
-    at = np.arange(len(seen)) / rate_hz
+    values = group.engineering(compute_counts(group, rows_of("disk_x", 0.05 * times), noise=False))[:, 0] * 1e-3
+    at = np.arange(len(values)) / rate_hz
     delay = 1.3065629648763766 / (math.pi * channel.bandwidth_hz)  # 83.2 us at 5 kHz
     settled = (at > 0.005) & (at < 0.019)
-    np.testing.assert_allclose(seen[settled], 0.05 * (at[settled] - delay), rtol=0, atol=2e-3 * abs(channel.scale))
+    np.testing.assert_allclose(values[settled], 0.05 * (at[settled] - delay), rtol=0, atol=2e-3 * abs(channel.scale))
 
 
 def test_a_step_is_answered_in_closed_form() -> None:
@@ -243,7 +243,7 @@ def test_a_step_is_answered_in_closed_form() -> None:
     channel = default_table().channels["P_E"].model_copy(update={"rate_hz": 51_200})
     group = group_of("forces").model_copy(update={"channels": (channel,), "rate_hz": 51_200})
     rows = rows_of("P_E", np.where(np.arange(200) < 100, 0.0, 5_000.0))
-    seen = group.engineering(compute_counts(group, rows, noise=False))[:, 0]
+    response = group.engineering(compute_counts(group, rows, noise=False))[:, 0]
     fine = np.arange(0, 200 * 64) / (ROW_RATE * 64)
     u = np.zeros(len(fine))
     for n in range(3, 199):
@@ -253,8 +253,8 @@ def test_a_step_is_answered_in_closed_form() -> None:
             u[64 * n : 64 * (n + 1)] += weight * rows[row, COLUMN["P_E"]]
     u[199 * 64 :] = 5_000.0
     _, y, _ = lsim(butter(4, 2.0 * math.pi * channel.bandwidth_hz, analog=True), u, fine)
-    expected = np.interp(np.arange(len(seen)) / 51_200, fine, y)
-    np.testing.assert_allclose(seen[:-4], expected[:-4], rtol=0, atol=0.5)
+    expected = np.interp(np.arange(len(response)) / 51_200, fine, y)
+    np.testing.assert_allclose(response[:-4], expected[:-4], rtol=0, atol=0.5)
 
 
 def test_corner_is_at_minus_3_db() -> None:
@@ -267,29 +267,29 @@ def test_a_slower_rate_has_a_lower_corner() -> None:
     group = default_table().select_groups(("forces",), 2_000).groups["forces"]
     times = np.arange(8_000) / ROW_RATE
     rows = rows_of("P_E", 5_000.0 * np.sin(2 * math.pi * 5_000.0 * times))
-    seen = group.engineering(compute_counts(group, rows, noise=False))
-    assert len(seen) == 400
+    values = group.engineering(compute_counts(group, rows, noise=False))
+    assert len(values) == 400
     # 5 kHz would fold back to 1 kHz; the corner of 500 Hz attenuates it by ten to the fourth.
-    assert np.abs(seen[200:]).max() < 5_000.0 * abs(compute_transfer(group.channels[0], 5_000.0)) * 1.1
+    assert np.abs(values[200:]).max() < 5_000.0 * abs(compute_transfer(group.channels[0], 5_000.0)) * 1.1
 
 
 def test_ac_coupling_forgets_a_step_with_its_time_constant() -> None:
     corner = default_table().channels["inner_x"].highpass_hz
     step = np.where(np.arange(ROW_RATE) < 4_000, 0.0, 100.0)
-    seen = compute_values("inner_x", step)
-    at = np.arange(len(seen)) / 20_000 - 0.1
+    values = compute_values("inner_x", step)
+    at = np.arange(len(values)) / 20_000 - 0.1
     later = at > 0.01
-    np.testing.assert_allclose(seen[later], 100.0 * np.exp(-2 * math.pi * corner * at[later]), rtol=2e-3)
-    assert np.abs(seen[at < -1e-3]).max() < 0.01
+    np.testing.assert_allclose(values[later], 100.0 * np.exp(-2 * math.pi * corner * at[later]), rtol=2e-3)
+    assert np.abs(values[at < -1e-3]).max() < 0.01
 
 
 @pytest.mark.parametrize("name", list(default_table().channels))
 def test_instruments_are_settled_at_sample_0(name: str) -> None:
     channel = default_table().channels[name]
     value = 0.7 * channel.si * (channel.range_v[1] - channel.bias_v) / abs(channel.sensitivity_v)
-    seen = compute_values(name, np.full(4_000, value))
+    values = compute_values(name, np.full(4_000, value))
     expected = 0.0 if channel.highpass_hz else value / channel.si
-    np.testing.assert_allclose(seen, expected, rtol=0, atol=abs(channel.scale))
+    np.testing.assert_allclose(values, expected, rtol=0, atol=abs(channel.scale))
 
 
 def test_first_sample_of_a_run_is_the_models_first_instant() -> None:

@@ -202,18 +202,18 @@ def test_a_status_line_is_one_line_of_whole_parts() -> None:
 def test_info_reports_an_impact_once_and_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
     from recorder.reader import Recording
 
-    told: list[float] = []
-    describe(Recording.open(HAMMER), quick=False, progress=told.append)
-    assert told == sorted(told)
-    assert 0.0 < told[0] <= told[-1] <= 1.0
-    assert len(told) > 10
+    parts: list[float] = []
+    describe(Recording.open(HAMMER), quick=False, progress=parts.append)
+    assert parts == sorted(parts)
+    assert 0.0 < parts[0] <= parts[-1] <= 1.0
+    assert len(parts) > 10
     assert sum("hammer: " in line for line in run_for_output(capsys, "info", HAMMER).splitlines()) == 1
 
 
 def test_commands_are_reported_once_with_or_without_effect() -> None:
     def command(tick: int, name: str, number: int, **request: float) -> dict[str, Any]:
-        taken = {"event": "command", "id": number, "command": name, "request": request, "from": f"me {number}"}
-        return {**taken, "tick": tick, "time_s": tick / 1e6}
+        event = {"event": "command", "id": number, "command": name, "request": request, "from": f"me {number}"}
+        return {**event, "tick": tick, "time_s": tick / 1e6}
 
     effects = [{"event": "hammer", "tick": tick, "time_s": tick / 1e6, "force_n": 100.0} for tick in (5, 7)]
     events = [command(5, "hammer", 1, force_n=100.0), effects[0], command(7, "hammer", 2, force_n=100.0), effects[1]]
@@ -244,8 +244,8 @@ def test_compilation_is_reported_while_it_lasts(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(compiling, "start_second_process", start)
     begun: list[str] = []
-    told: list[str] = []
-    listener = Compiling(begun.append, told.append)
+    texts: list[str] = []
+    listener = Compiling(begun.append, texts.append)
 
     def event(module: str) -> Any:
         return SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=SimpleNamespace(__module__=module))})
@@ -259,7 +259,7 @@ def test_compilation_is_reported_while_it_lasts(monkeypatch: pytest.MonkeyPatch)
             listener.on_start(event(module))
         for module in modules:
             listener.on_end(event(module))
-    assert [text.partition(" (")[0] for text in told] == [
+    assert [text.partition(" (")[0] for text in texts] == [
         "compiling split.method", "compiling in a second process", "", "compiling laws.contact", "",
     ]  # fmt: skip
     (first,) = begun

@@ -19,17 +19,17 @@ class Counting(MemoryServer):
 def test_clients_of_all_transports_subscribe_request_and_report() -> None:
     servers = [MemoryServer(), MemoryServer()]
     both = Fanout(servers)
-    heard: list[tuple[int, str, bytes]] = []
+    received: list[tuple[int, str, bytes]] = []
     reports: list[bytes] = []
     tokens: list[tuple[int, bool]] = []
     both.subscribe_reports("rig/clients/*", lambda _, payload: reports.append(payload))
     both.answer(wire.STATUS, lambda payload: payload + b"!")
     for number, server in enumerate(servers):
         client = MemoryClient(server)
-        client.subscribe("rig/**", lambda key, payload, number=number: heard.append((number, key, payload)))
+        client.subscribe("rig/**", lambda key, payload, number=number: received.append((number, key, payload)))
         client.watch(wire.ALIVE, lambda there, number=number: tokens.append((number, there)))
     both.publish(wire.EVENTS, b"1")
-    assert heard == [(0, wire.EVENTS, b"1"), (1, wire.EVENTS, b"1")]
+    assert received == [(0, wire.EVENTS, b"1"), (1, wire.EVENTS, b"1")]
     for server in servers:
         assert MemoryClient(server).request(wire.STATUS, b"?") == b"?!"
         MemoryClient(server).report("rig/clients/a", b"here")

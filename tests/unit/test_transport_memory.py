@@ -49,22 +49,22 @@ def test_a_closed_client_receives_nothing_more() -> None:
 
 
 def test_requests_reports_and_the_token() -> None:
-    server, received, seen = MemoryServer(), [], []
+    server, received, tokens = MemoryServer(), [], []
     client = MemoryClient(server)
     with pytest.raises(NoReplyError, match="rig/status"):
         client.request("rig/status")
     server.answer("rig/status", lambda payload: payload + b"!")
     server.subscribe_reports("rig/clients/*", lambda *report: received.append(report))
-    client.watch("rig/alive", seen.append)
-    assert seen == []
+    client.watch("rig/alive", tokens.append)
+    assert tokens == []
     server.announce()
-    MemoryClient(server).watch("rig/alive", seen.append)
+    MemoryClient(server).watch("rig/alive", tokens.append)
     assert client.request("rig/status", b"well") == b"well!"
     client.report("rig/clients/me", b"1")
     client.report("rig/others/me", b"2")
     assert received == [("rig/clients/me", b"1")]
     server.close()
     server.close()
-    assert seen == [True, True, False, False]
+    assert tokens == [True, True, False, False]
     with pytest.raises(NoReplyError):
         client.request("rig/status")

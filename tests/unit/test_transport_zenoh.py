@@ -137,15 +137,15 @@ def test_a_failing_handler_still_handles_the_next_request(server: ZenohServer) -
             raise RuntimeError("no reply for this")
         return payload[::-1]
 
-    told: list[tuple[str, str]] = []
-    server.on_failure(lambda where, error: told.append((where, str(error))))
+    failures: list[tuple[str, str]] = []
+    server.on_failure(lambda where, error: failures.append((where, str(error))))
     server.answer("rig/status", handler)
     with ZenohClient(server.endpoint) as client:
         assert client.request("rig/status", b"abc") == b"cba"
         with pytest.raises(NoReplyError, match="no reply for this"):
             client.request("rig/status", b"bad")
         assert client.request("rig/status") == b""
-        assert told == [("zenoh answers rig/status", "no reply for this")]
+        assert failures == [("zenoh answers rig/status", "no reply for this")]
         with pytest.raises(NoReplyError, match=server.endpoint):
             client.request("rig/nothing", timeout_s=0.1)
 
@@ -180,32 +180,32 @@ def test_every_first_request_is_answered(server: ZenohServer) -> None:
 
 
 def test_reports_reach_the_rig_and_not_the_own_subscriptions(server: ZenohServer) -> None:
-    heard: list[tuple[str, bytes]] = []
+    reports: list[tuple[str, bytes]] = []
     own: list[tuple[str, bytes]] = []
-    server.subscribe_reports("rig/clients/*", lambda key, payload: heard.append((key, payload)))
+    server.subscribe_reports("rig/clients/*", lambda key, payload: reports.append((key, payload)))
     with ZenohClient(server.endpoint) as client:
         client.subscribe("rig/**", lambda key, payload: own.append((key, payload)))
         client.report("rig/clients/a", b"1")
-        until(lambda: bool(heard))
+        until(lambda: bool(reports))
         server.publish("rig/events", b"x")
         until(lambda: bool(own))
-    assert heard == [("rig/clients/a", b"1")]
+    assert reports == [("rig/clients/a", b"1")]
     assert own == [("rig/events", b"x")]
 
 
 def test_the_token_appears_when_announced_and_vanishes_on_close() -> None:
-    seen: list[bool] = []
+    states: list[bool] = []
     with ZenohServer(free_endpoint()) as server, ZenohClient(server.endpoint) as client:
-        client.watch("rig/alive", seen.append)
+        client.watch("rig/alive", states.append)
         server.announce()
-        until(lambda: seen == [True])
+        until(lambda: states == [True])
         with ZenohClient(server.endpoint) as second:
             late: list[bool] = []
             second.watch("rig/alive", late.append)
             until(lambda: late == [True])
         server.close()
-        until(lambda: len(seen) == 2)
-        assert seen == [True, False]
+        until(lambda: len(states) == 2)
+        assert states == [True, False]
 
 
 def test_a_subscriber_with_history_misses_nothing_at_any_start(server: ZenohServer) -> None:
@@ -456,7 +456,7 @@ def test_a_blocking_callback_delays_neither_requests_nor_recovery(
     monkeypatch.setattr("rig.serve.transport.zenoh._HEARTBEAT_S", 0.01)
     keys, messages = [f"rig/sensors/g{n}" for n in range(6)], 2500
     got: dict[str, list[int]] = {key: [] for key in keys}
-    seen: list[bool] = []
+    states: list[bool] = []
     missed: list[int] = []
     go = threading.Event()
 
@@ -466,14 +466,14 @@ def test_a_blocking_callback_delays_neither_requests_nor_recovery(
 
     with ZenohServer(free_endpoint()) as server, ZenohClient(server.endpoint) as client:
         server.answer("rig/scene", lambda _: b"pong")
-        client.watch("rig/alive", seen.append)
+        client.watch("rig/alive", states.append)
         client.subscribe("rig/sensors/*", take, on_miss=lambda _, count: missed.append(count), history=True)
         for number in range(messages):
             for key in keys:
                 server.publish(key, number.to_bytes(8, "little") + bytes(2000))
         assert client.request("rig/scene", timeout_s=20.0) == b"pong"
         server.announce()
-        until(lambda: seen == [True])
+        until(lambda: states == [True])
         go.set()
         until(lambda: all(len(numbers) == messages for numbers in got.values()))
     assert all(numbers == list(range(messages)) for numbers in got.values())

@@ -283,12 +283,12 @@ def test_few_channels_and_no_truth_are_enough(tmp_path: Path) -> None:
 
 
 def test_rows_of_another_clock_are_between_the_models(
-    hammer: Recording, heard: tuple[dict[str, Measured], Prediction]
+    hammer: Recording, measured: tuple[dict[str, Measured], Prediction]
 ) -> None:
     """A recorder at 1/3 of a millisecond past every row: no row of the model coincides."""
     from scipy.interpolate import CubicSpline
 
-    parts, nominal = heard
+    parts, nominal = measured
     part = parts["probes"]
     late = replace(part, times_s=part.times_s[:40] + 1e-3 / 3.0, index=part.index[:40], values=part.values[:40])
     between = predict(simplify(Experiment.from_recording(hammer)), {"probes": late}).values["probes"]
@@ -306,7 +306,7 @@ def explained(recording: Recording, parts: dict[str, Measured], nominal: Predict
 
 
 @pytest.fixture(scope="module")
-def heard(hammer: Recording) -> tuple[dict[str, Measured], Prediction]:
+def measured(hammer: Recording) -> tuple[dict[str, Measured], Prediction]:
     experiment = Experiment.from_recording(hammer)
     parts = read_measured(hammer, experiment.scene, longest_s=1.0)
     return parts, predict(simplify(experiment), parts)
@@ -329,13 +329,13 @@ def with_fault(parts: dict[str, Measured], group: str, matrix: np.ndarray, shift
 )
 def test_a_sensor_fault_is_classified_as_one(
     hammer: Recording,
-    heard: tuple[dict[str, Measured], Prediction],
+    measured: tuple[dict[str, Measured], Prediction],
     matrix: np.ndarray,
     shift: float,
     name: str,
     change: str,
 ) -> None:
-    parts, nominal = heard
+    parts, nominal = measured
     found = explained(hammer, with_fault(parts, "probes", matrix, shift), nominal)
     assert found.best == (name,)
     assert found.conclusion.startswith("sensor: ")
@@ -343,10 +343,10 @@ def test_a_sensor_fault_is_classified_as_one(
     assert one.change.replace("+0.99", "+1").startswith(change[:5]) or one.change == change
 
 
-def test_a_late_clock_is_called_time(hammer: Recording, heard: tuple[dict[str, Measured], Prediction]) -> None:
+def test_a_late_clock_is_called_time(hammer: Recording, measured: tuple[dict[str, Measured], Prediction]) -> None:
     from scipy.interpolate import CubicSpline
 
-    parts, nominal = heard
+    parts, nominal = measured
     late = {}
     for name, part in parts.items():
         noise = part.values - nominal.values[name]

@@ -155,13 +155,13 @@ def test_a_single_wrong_probe_pair_is_found(good: Recording, tmp_path: Path) -> 
 
 
 def test_a_lost_block_does_not_pass(good: Recording, tmp_path: Path) -> None:
-    seen = {"blocks": 0}
+    count = {"blocks": 0}
 
     def lossy(key: str, payload: bytes) -> list[bytes]:
         if key != wire.sensor_key("forces"):
             return [payload]
-        seen["blocks"] += 1
-        return [] if seen["blocks"] == 7 else [payload]
+        count["blocks"] += 1
+        return [] if count["blocks"] == 7 else [payload]
 
     verdict = judge(rewrite(good, tmp_path / "lossy.mcap", lossy))
     assert bad(verdict) == {"samples lost"}

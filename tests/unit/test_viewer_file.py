@@ -318,11 +318,11 @@ def test_the_command_accepts_parts_and_shows_notes(tmp_path: Path, capsys: pytes
 def test_a_picture_gets_its_name_only_when_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded, target = tmp_path / "run.mcap", tmp_path / "run.rrd"
     write_recording(recorded, list(generate_stream(20)))
-    seen: list[list[str]] = []
+    listings: list[list[str]] = []
     paint = file.paint
 
     def spied(*arguments: Any) -> file.Painted:
-        seen.append(sorted(path.name for path in tmp_path.glob("run.rrd*")))
+        listings.append(sorted(path.name for path in tmp_path.glob("run.rrd*")))
         return paint(*arguments)
 
     def fails(*arguments: Any) -> file.Painted:
@@ -337,7 +337,7 @@ def test_a_picture_gets_its_name_only_when_complete(tmp_path: Path, monkeypatch:
         assert (ended.value.code or 0) == code
         assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]
         assert (target.read_bytes() == b"precious") == bool(code)
-    assert seen == [["run.rrd", "run.rrd.part"]]
+    assert listings == [["run.rrd", "run.rrd.part"]]
 
 
 def test_faults_and_commands_are_marks_from_begin_to_end(tmp_path: Path) -> None:

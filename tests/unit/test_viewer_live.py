@@ -177,7 +177,7 @@ def test_a_slow_viewer_gets_fewer_pictures_with_all_peaks(recording: Synthetic, 
     client = ScriptedClient(recording, [])
     stream = new_stream("paced")
     stream.save(tmp_path / "paced.rrd")
-    said: list[str] = []
+    messages: list[str] = []
     view = live.LiveView(
         client, Canvas(stream), live.request_document(client), get_processed=lambda: 1_000_000 if prompt else 0
     )
@@ -188,13 +188,13 @@ def test_a_slow_viewer_gets_fewer_pictures_with_all_peaks(recording: Synthetic, 
         del blocks[:5]
         return False
 
-    assert view.run(stop=publish, on_message=said.append) == "the rig ended: completed"
+    assert view.run(stop=publish, on_message=messages.append) == "the rig ended: completed"
     stream.flush()
     stream.disconnect()
     saved = Saved(tmp_path / "paced.rrd")
     pictures = len(saved["/orbit/ring/trace", "LineStrips2D:strips"].values)
     assert pictures > 5 if prompt else pictures <= 2
-    assert said[-1].startswith("viewer late by 0." if prompt else "viewer loading")
+    assert messages[-1].startswith("viewer late by 0." if prompt else "viewer loading")
     ring = saved["/sensors/probes/ring", "Scalars:scalars"]
     assert view.received == 5 * len(recording.times_s)
     assert max(row[0] for row in ring.values) == pytest.approx(RADIUS_MM, abs=3e-3)
