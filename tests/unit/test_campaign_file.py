@@ -408,6 +408,8 @@ def test_a_device_outside_lockstep_leaves_other_events_to_the_campaign(expect: s
     devices = OUTSIDE.replace("device = ", "devices = [").strip() + ', { command = "python", name = "in" }]\n'
     steps = '[[steps]]\nat_s = 1.0\nnote = "now"\n'
     assert load(tmp_path, HEAD + devices + steps + "[[expect]]\n" + expect).cases
+    if "from" not in expect:
+        assert load(tmp_path, HEAD + OUTSIDE + steps + "[[expect]]\n" + expect).cases
 
 
 def test_a_device_outside_lockstep_may_be_judged_in_real_time_and_by_its_file(tmp_path: Path) -> None:

@@ -288,12 +288,13 @@ def test_notes_and_commands_of_devices_on_a_bus_are_ordered_by_name_and_never_ho
         commands.take(*sender_frame(message, 7, speed[0][1]))
         commands.take(*speed[0])
         commands.take(*device_frame(message, DeviceKind.DONE, 7, block=1))
-        commands.take(*speed[1])  # of nobody that was announced: not held up
+        commands.take(*sender_frame(message, 3, command_frame(CommandKind.SPEED, 2, speed_hz=9.0)[1]))
+        commands.take(*speed[1])  # another command than the announced one: of nobody, and not held up
         until(lambda: commands.accepted == 1)
+        assert [row.started for row in commands.waiting] == [True, False, False], "one after another"
         time.sleep(1.1)  # longer than a command may wait for its reply
         commands.time_out()
         assert not rig.listener.named("note")
-        commands.take(*sender_frame(message, 3, speed[0][1]))  # announces another command
         commands.take(*sender_frame(message, 3, speed[2][1]))
         commands.take(*speed[2])
         commands.take(*note_frame(message, NoteKind.TRIP, 3))
