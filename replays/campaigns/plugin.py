@@ -37,6 +37,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--rig-url", metavar="URL", help="run on the rig there instead of on rigs of the tests' own")
     group.addoption("--rig-device", metavar="COMMAND", help="command line of the device under test in TOML campaigns")
     group.addoption("--rig-limit", metavar="NAME=QUANTITY", action="append", help="limit that replaces the file's")
+    group.addoption("--rig-sheet", metavar="FILE", action="append", help="sheet to hand in, .html or .pdf")
+    group.addoption("--rig-identity", metavar="NAME=TEXT", action="append", help="identity of the device, on the sheet")
     group.addoption("--rig-replay", metavar="FILE", help="run on a recording that is played")
 
 

@@ -67,8 +67,8 @@ def _failure(report: Report, case: Document, folder: Path) -> None:
     if not failed:
         report.text(case["reason"])
     for each in failed:
-        limit, value = _limit(each), _number(each["value"], each["unit"], "nothing")
-        margin = f", margin {_number(each['margin'], each['unit'])}" if each["margin"] is not None else ""
+        limit, value = format_limit(each), format_number(each["value"], each["unit"], "nothing")
+        margin = f", margin {format_number(each['margin'], each['unit'])}" if each["margin"] is not None else ""
         source = f" Source: {each['source']}." if each["source"] else ""
         note = f" ({each['note']})" if each["note"] else ""
         verdict = "inconclusive" if each["outcome"] == "inconclusive" else f"it is {value}{margin}"
@@ -90,8 +90,8 @@ def _measurements(report: Report, results: Document, case: Document) -> None:
     caption = f"Resolution of reaction times: {case['resolution']}.{judge_value}" if case["resolution"] else ""
     rows = [
         Row((
-            each["name"], _number(each["value"], each["unit"], "nothing"), _limit(each),
-            "" if each["margin"] is None else _number(each["margin"], each["unit"]), each["source"], each["note"],
+            each["name"], format_number(each["value"], each["unit"], "nothing"), format_limit(each),
+            "" if each["margin"] is None else format_number(each["margin"], each["unit"]), each["source"], each["note"],
             each["outcome"],
         ), OUTCOME_MARKS[each["outcome"]])
         for each in case["measurements"]
@@ -100,11 +100,13 @@ def _measurements(report: Report, results: Document, case: Document) -> None:
     report.table(headings, rows, caption=caption)
 
 
-def _number(value: float | None, unit: str, none: str = "") -> str:
+def format_number(value: float | None, unit: str, none: str = "") -> str:
+    """Return a number with its unit, or `none`."""
     return none if value is None else with_unit(f"{value:.6g}", unit)
 
 
-def _limit(each: Document) -> str:
+def format_limit(each: Document) -> str:
+    """Return the limit of a measurement, with its unit."""
     limit = each["limit"]
     if isinstance(limit, list):
         return with_unit(f"{limit[0]:.6g} to {limit[1]:.6g}", each["unit"])
@@ -143,7 +145,7 @@ def changes(then: Document, now: Document) -> Iterator[Row]:
                 continue
             moved = each["margin"] - past["margin"]
             if abs(moved) > _UNCHANGED_MARGIN * max(abs(each["margin"]), abs(past["margin"])):
-                shown = (_number(one["margin"], one["unit"]) for one in (past, each))
+                shown = (format_number(one["margin"], one["unit"]) for one in (past, each))
                 yield _row(name, f"margin of {each['name']}", *shown, better=moved > 0.0)
 
 

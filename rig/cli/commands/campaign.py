@@ -49,6 +49,14 @@ def campaign(
         list[str] | None,
         typer.Option(metavar="NAME=QUANTITY", help="Replace a limit of the file, as in danger='500 um'; repeatable"),
     ] = None,
+    sheet: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="Write a sheet to hand in, .html or .pdf, with evidence of all cases"),
+    ] = None,
+    identity: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=TEXT", help="Identity on the sheet: name, serial, firmware, operator; repeatable"),
+    ] = None,
     url: Annotated[
         str | None, typer.Option(metavar="URL", help="Use the rig at this URL; skip cases that it cannot run")
     ] = None,
@@ -74,12 +82,22 @@ def campaign(
         raise InputError("--jobs", "1 with --url, as the cases share one rig", jobs)
     if output is not None:
         check_folder(output, field="--output")
+    if sheet:
+        from replays.campaigns.reporting.sheet import check_sheet, parse_identity
+
+        if output is None:
+            raise InputError("--output", "given with --sheet", None)
+        parse_identity(identity or [])
+        for file in sheet:
+            check_sheet(file)
     files = _check_files(files, against, replay, device, limit or ())
     plugin_options = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
     plugin_options["--rig-device"] = device
     options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
     options += ["-k", keyword] if keyword is not None else []
     options += [word for each in limit or () for word in ("--rig-limit", each)]
+    options += [word for each in sheet or () for word in ("--rig-sheet", str(each.absolute()))]
+    options += [word for each in identity or () for word in ("--rig-identity", each)]
     options += ["-x"] if exit_first else []
     options += ["-n", str(jobs)] if jobs > 1 else ["-n", "0"] if importlib.util.find_spec("xdist") else []
     status = _run(files, options, output)
