@@ -25,6 +25,7 @@ from replays.campaigns.measurement import Measurement, Must, judge_value
 from replays.campaigns.reporting.page import changes, make_page
 from replays.campaigns.reporting.picture import draw
 from replays.campaigns.reporting.results import Results, load_results, write_junit
+from replays.campaigns.reporting.sheet import check_sheet, make_sheet, parse_identity
 from replays.report import junit, write_report
 from rig.base.checks import check
 from rig.base.errors import InputError
@@ -329,6 +330,26 @@ def test_the_page_lists_failures_first_then_changes(tmp_path: Path) -> None:
     assert places == sorted(places)
 
 
+def test_the_sheet_has_identity_verdicts_digests_and_room_to_sign(tmp_path: Path) -> None:
+    found, left = results(good=0.4, bad=-0.25), results(good=0.4, bad=0.1, fresh=0.2)
+    left["cases"], left["counts"] = left["cases"][:3], {**dict.fromkeys(left["counts"], 0), "passed": 3}
+    left["cases"][0]["digests"] = {"x.campaign.toml": "0a1b", "session.mcap of good": "2c3d"}
+    write_report(make_sheet(left, tmp_path, parse_identity(["serial=A7", "site = Lyngby"]), found), tmp_path / "s.html")
+    page = " ".join(re.sub(r"<[^>]*>", " ", (tmp_path / "s.html").read_text(encoding="utf-8")).split())
+    for text in (
+        "serial A7", "site Lyngby", "x.campaign.toml 0a1b", "session.mcap of good 2c3d", "approved by",
+        "x.campaign.toml::bad failed passed", "x.campaign.toml::fresh not tested passed", "PASS: 3 passed.",
+    ):  # fmt: skip
+        assert text in page, text
+    assert "FAIL: " in make_sheet(found, tmp_path, {}).lead
+    for texts in (["serial"], ["=A7"], ["serial="], ["serial=1", "serial=2"]):
+        with pytest.raises(InputError, match="--identity must be NAME=TEXT"):
+            parse_identity(texts)
+    for path in (tmp_path / "s.txt", tmp_path / "none/s.pdf"):
+        with pytest.raises(InputError, match="--sheet must be"):
+            check_sheet(path)
+
+
 def test_a_truncated_recording_cannot_be_a_bench(tmp_path: Path) -> None:
     data, half = (ROOT / "replays/sessions/hammer-6.2.mcap").read_bytes(), tmp_path / "half.mcap"
     half.write_bytes(data[: len(data) // 2])
@@ -338,7 +359,7 @@ def test_a_truncated_recording_cannot_be_a_bench(tmp_path: Path) -> None:
 
 
 def test_two_campaigns_cannot_write_into_one_folder(tmp_path: Path) -> None:
-    config = cast("Any", SimpleNamespace())
+    config = cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None)))
     first = Results(tmp_path / "out", None, config)
     with pytest.raises(InputError, match=r"^--output must be a folder that no other running campaign writes to"):
         Results(tmp_path / "out", None, config)

@@ -105,10 +105,10 @@ class Results:
         from replays.campaigns.reporting.page import make_page
 
         write_report(make_page(document, self._folder, self._earlier), self._folder / "index.html")
-        for sheet in self._config.getoption("rig_sheet") or ():
+        for sheet in self._config.option.rig_sheet or ():
             from replays.campaigns.reporting.sheet import make_sheet, parse_identity
 
-            identity = parse_identity(self._config.getoption("rig_identity") or [])
+            identity = parse_identity(self._config.option.rig_identity or [])
             write_report(make_sheet(document, self._folder, identity, self._earlier), Path(sheet))
         os.close(self._lock)
 
