@@ -73,7 +73,12 @@ def make_writer(path: Path, simulation: Simulation, *, force: bool = False) -> R
 
 
 def write_run(
-    simulation: Simulation, path: Path, *, force: bool = False, progress: Callable[[float], None] = lambda part: None
+    simulation: Simulation,
+    path: Path,
+    *,
+    force: bool = False,
+    progress: Callable[[float], None] = lambda part: None,
+    observe: Callable[[Frame], None] = lambda frame: None,
 ) -> None:
     """Run a scene to its end at full speed, and write it to a file; remove the file on an error.
 
@@ -82,6 +87,7 @@ def write_run(
         path: File that ends in .mcap (as from `rig record`), .parquet, .csv or .wav.
         force: Replace an existing file.
         progress: Callback for the completed fraction, 0 to 1.
+        observe: Callback for each frame, whose rows the next frame overwrites.
 
     Raises:
         InputError: The destination cannot be used.
@@ -98,6 +104,7 @@ def write_run(
     with make_writer(path, simulation, force=force) as writer:
         for frame in frames(simulation):
             writer.write(frame)
+            observe(frame)
             progress(simulation.tick / simulation.end_tick)
 
 

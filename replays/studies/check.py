@@ -1,23 +1,46 @@
-"""Accuracy check of a run: comparison with the same scene at a finer tolerance or step."""
+"""Accuracy check of a run: the rows that were written, compared with a second run of the scene on another engine."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from replays.studies.common.run import bare_sensors, run_scene
 from replays.studies.peers.common.problem import scaled_error
 from rig.base.errors import InputError
+from rig.channels.orbit import whirl_frequency
 from rig.physics.engines import ENGINES
-from rig.physics.kernels.signals import N_STATE
+from rig.physics.kernels.signals import COLUMN
 from rig.run.scenes import Scene, parse_scene
-from rig.run.simulation import Simulation
+from rig.run.simulation import Frame, Simulation
 
 MAX_BRANCH_ERROR = 0.1
 """Scaled error from which two runs no longer describe the same motion."""
-_TOLERANCE_FACTOR = 0.1
-"""Factor on the tolerance of an adaptive engine; steps of a fixed-step engine are halved instead."""
+_REFERENCE_TOLERANCE = 1e-12
+"""Scaled error of a step of the reference run; its total error is then about 1e-9 in impacts and 1e-5 in bounces."""
+_REFERENCES = ("taylor", "rk8", "tsit5", next(iter(ENGINES)))
+"""Engines for the reference run, the most accurate first; the default engine alone supports rigid impacts."""
+_SAME_ENGINE_REFINEMENT = 0.01
+"""Factor on the tolerance if only the run's own engine supports the model."""
+_SETTLED_SHARE, _MIN_SETTLED_ROWS = 0.25, 20
+"""Last part of a run in which the whirl is measured, and its minimum number of rows."""
+_MIN_WHIRL_RADIUS = 0.5
+"""Smallest orbit radius that has a whirl frequency, as a share of the clearance."""
+
+
+class Quantities(NamedTuple):
+    """Quantities of a run: contacts, largest contact force [N], whirl frequency [Hz] and mean radius [um] at the end.
+
+    Frequency and radius are NaN if the shaft does not whirl by a turn in the last quarter of the run.
+    """
+
+    contacts: int
+    peak_force_n: float
+    frequency_hz: float = math.nan
+    radius_um: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -25,79 +48,117 @@ class Check:
     """Comparison of two runs of a scene.
 
     Attributes:
-        finer: Engine and setting of the second run, in words.
+        reference: Engine and tolerance of the second run, in words.
         error: RMS distance of the scaled states at the truth's rate, as in the charts.
         parted_s: First time at which a scaled state differs by `MAX_BRANCH_ERROR`, or None.
-        contacts: Contacts in the run and in the finer run.
+        quantities: Quantities of the run and of the reference run.
     """
 
-    finer: str
+    reference: str
     error: float
     parted_s: float | None
-    contacts: tuple[int, int]
+    quantities: tuple[Quantities, Quantities]
+
+    @property
+    def informs(self) -> bool:
+        """False if both runs are identical, so that their difference is no error estimate."""
+        return self.error > 0.0
 
     @property
     def wrong_branch(self) -> bool:
-        """True if the run probably follows another branch of motion than the model."""
-        return self.error > MAX_BRANCH_ERROR or abs(self.contacts[0] - self.contacts[1]) > 0.2 * max(self.contacts)
+        """True if the run probably follows another branch of motion than the model.
+
+        Contacts alone do not decide: bounces that die out end in ever more and ever smaller contacts.
+        """
+        contacts = [each.contacts for each in self.quantities]
+        miscounted = abs(contacts[0] - contacts[1]) > 0.2 * max(contacts)
+        return self.error > MAX_BRANCH_ERROR or (miscounted and self.parted_s is not None)
 
     def line(self) -> str:
         """Return the result on one line."""
+        if not self.informs:
+            return f"no information: the run and {self.reference} are identical"
+        one, other = self.quantities
+        facts = f"scaled error {self.error:.1e} (1: as large as the motion); {one.contacts} and {other.contacts} "
+        facts += f"contacts, peak force {one.peak_force_n:.6g} and {other.peak_force_n:.6g} N"
+        if not math.isnan(one.radius_um + other.radius_um):
+            facts += f"; in the last quarter whirl {one.frequency_hz:.6g} and {other.frequency_hz:.6g} Hz, "
+            facts += f"radius {one.radius_um:.6g} and {other.radius_um:.6g} µm"
         if self.wrong_branch:
             since = f" after {self.parted_s:g} s" if self.parted_s is not None else ""
-            return (
-                f"a wrong branch is suspected{since}: {self.finer} follows another motion "
-                f"(error {self.error:.1e}, {self.contacts[0]} against {self.contacts[1]} contacts)"
-            )
-        return f"error {self.error:.1e} of 1 against {self.finer}; {self.contacts[0]} and {self.contacts[1]} contacts"
+            return f"a wrong branch is suspected{since}: {self.reference} follows another motion ({facts})"
+        return f"against {self.reference}: {facts}"
 
 
-def refine(scene: Scene) -> dict[str, float]:
-    """Return changes to a scene's engine that make it more accurate.
+def choose_reference(scene: Scene) -> tuple[str, float]:
+    """Return engine and tolerance of the reference run: another engine, if one supports the model.
+
+    A finer tolerance of the same engine would be no check: where `engine.step_us` limits the steps, it has no effect.
 
     Raises:
-        InputError: If there is no finer step.
+        InputError: If there is none, or the scene has no model.
     """
     scene.check_physics()
-    engine = scene.engine
-    if ENGINES[engine.name].tolerance:
-        return {"tolerance": engine.tolerance * _TOLERANCE_FACTOR}
-    if engine.step_us < 2:
-        raise InputError("engine.step_us", "at least 2, for a check by finer steps", engine.step_us)
-    sample_us = 1_000_000 // scene.sensors.truth_rate_hz
-    return {"step_us": max(n for n in range(1, engine.step_us // 2 + 1) if sample_us % n == 0)}
+    own, model = scene.engine, scene.model
+    for name in _REFERENCES:
+        method = ENGINES[name]
+        if model.friction in method.frictions and model.contact in method.contacts:
+            if name == _REFERENCES[-1]:
+                return name, _SAME_ENGINE_REFINEMENT * min(own.tolerance or method.tolerance, method.tolerance)
+            if name != own.name:
+                return name, _REFERENCE_TOLERANCE
+    raise InputError("--check", "left out for a model that only one engine supports", own.name)
 
 
-def check(scene: Scene) -> Check:
-    """Run a scene twice without sensors, as it is and with a more accurate engine.
+def sample_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
+    """Return a copy of a frame's rows at the truth's rate, shape (n, N_ROW)."""
+    return frame.rows[:: _count_rows(simulation)].copy()
+
+
+def check(simulation: Simulation, frames: list[np.ndarray]) -> Check:
+    """Compare a completed run with a reference run of its scene.
 
     Args:
-        scene: The scene.
+        simulation: The simulation at its end.
+        frames: Rows of all its frames, by `sample_rows`.
 
     Raises:
-        InputError: If there is no finer step.
+        InputError: If no engine can check the scene.
     """
-    changes = refine(scene)
-    setting = f"tolerance {changes['tolerance']:.2g}" if "tolerance" in changes else f"{changes['step_us']} us"
-    coarse, fine = _states(scene, {}), _states(scene, changes)
-    n = min(len(coarse[0]), len(fine[0]))
-    errors = np.array([scaled_error(a[None, :], b[None, :]) for a, b in zip(coarse[0][:n], fine[0][:n], strict=True)])
-    parted = np.flatnonzero(errors > MAX_BRANCH_ERROR)
-    return Check(
-        finer=f"{scene.engine.name} at {setting}",
-        error=float(np.sqrt(np.mean(errors**2))),
-        parted_s=float(parted[0]) / scene.sensors.truth_rate_hz if len(parted) else None,
-        contacts=(coarse[1], fine[1]),
-    )
-
-
-def _states(scene: Scene, changes: dict[str, float]) -> tuple[np.ndarray, int]:
-    """Return states at the truth's rate, shape (n, N_STATE), and the number of contacts."""
+    scene = simulation.scene
+    name, tolerance = choose_reference(scene)
     document = scene.model_dump()
     document["sensors"] |= bare_sensors(scene.sensors.truth_rate_hz)
     document["channels"] = None
-    document["engine"] |= changes
-    simulation = Simulation(parse_scene({**document, "fidelity": "given"}))
-    every = simulation.tick_rate_hz // scene.sensors.truth_rate_hz // simulation.row_ticks
-    done = run_scene(simulation, block_ticks=simulation.end_tick, every=every)
-    return done.rows[:, :N_STATE], int(simulation.health()["contacts"])
+    engine = {"name": name, "tolerance": tolerance, "companion": False}
+    other = Simulation(parse_scene({**document, "engine": engine, "fidelity": "given"}))
+    rows, fine = np.concatenate(frames), run_scene(other, block_ticks=other.end_tick, every=_count_rows(other)).rows
+    n = min(len(rows), len(fine))
+    errors = np.array([scaled_error(a[None], b[None]) for a, b in zip(rows[:n], fine[:n], strict=True)])
+    parted = np.flatnonzero(errors > MAX_BRANCH_ERROR)
+    return Check(
+        reference=f"{name} at tolerance {tolerance:.2g}",
+        error=float(np.sqrt(np.mean(errors**2))),
+        parted_s=float(parted[0]) / scene.sensors.truth_rate_hz if len(parted) else None,
+        quantities=(_measure(simulation, rows), _measure(other, fine)),
+    )
+
+
+def _count_rows(simulation: Simulation) -> int:
+    """Return the rows per row of the truth."""
+    return simulation.tick_rate_hz // simulation.scene.sensors.truth_rate_hz // simulation.row_ticks
+
+
+def _measure(simulation: Simulation, rows: np.ndarray) -> Quantities:
+    health = simulation.health()
+    found = Quantities(health["contacts"], health["peak_normal_force_n"])
+    last = rows[-int(_SETTLED_SHARE * len(rows)) :, [COLUMN["ring_x"], COLUMN["ring_y"]]]
+    radius = np.hypot(*last.T)
+    clearance = simulation.model.constants.contact.clearance
+    if len(last) < _MIN_SETTLED_ROWS or not radius.min() > _MIN_WHIRL_RADIUS * clearance:
+        return found
+    times_s = np.arange(len(last)) / simulation.scene.sensors.truth_rate_hz
+    frequency = whirl_frequency(last[:, 0], last[:, 1], times_s, about=0j)
+    if abs(frequency) * times_s[-1] < 1.0:
+        return found
+    return found._replace(frequency_hz=frequency, radius_um=1e6 * float(radius.mean()))

@@ -79,6 +79,7 @@ class Accuracy:
         estimate: Largest distance of all states at the same instant, RMS of the scaled states (`STATE_SCALE`) [1].
         grown_per_s: Mean growth rate of a small distance [1/s].
         errors: Largest error of each of `QUANTITIES` [SI], shape (6,).
+        largest_s: Start of the window of each of those errors [s], shape (6,).
         since_s: Start of the window in which a quantity exceeded its tolerance [s].
         peak_force: Largest contact force of the compared samples [N].
     """
@@ -90,6 +91,7 @@ class Accuracy:
     estimate: float = 0.0
     grown_per_s: float = 0.0
     errors: np.ndarray = field(default_factory=lambda: np.zeros(len(QUANTITIES)))
+    largest_s: np.ndarray = field(default_factory=lambda: np.zeros(len(QUANTITIES)))
     since_s: dict[str, float] = field(default_factory=dict)
     peak_force: float = 0.0
     _first: tuple[float, float] | None = None
@@ -154,12 +156,13 @@ class Accuracy:
         parts = [
             f"{one['label']} off by {one['error']:.2g} {one['unit']} "
             f"({'limit' if name in self.limits else 'tolerance'} {one['tolerance']:.2g}) "
-            f"since {one['exceeded_s']:.3f} s"
-            for name, one in self.document()["quantities"].items()
+            f"since {one['exceeded_s']:.3f} s, largest at {largest_s:.3f} s"
+            for (name, one), largest_s in zip(self.document()["quantities"].items(), self.largest_s, strict=True)
             if one["exceeded_s"] is not None
         ]
-        advice = f"differences grow by {self.grown_per_s:.3g} 1/s: set a finer engine.tolerance ({self.tolerance:g})"
-        return f"accuracy: {'; '.join(parts)}; {advice}, or use statistics only" if parts else ""
+        finer = f"engine.tolerance is now {self.tolerance:.2g}, try {self.tolerance / 10.0:.2g}"
+        advice = f"differences grow by {self.grown_per_s:.3g} 1/s: {finer}, or use statistics only"
+        return f"accuracy: {'; '.join(parts)}; {advice}" if parts else ""
 
     def _tolerances(self) -> dict[str, float]:
         """Return the tolerance of each quantity that has one [SI]."""
@@ -194,6 +197,7 @@ class Accuracy:
             frequency = abs(turned[-1] - turned[0]) / (2.0 * math.pi * span_s)
         angle = np.abs(between[whirls]).max(initial=0.0)
         window_errors = np.array([errors[0], errors[1], frequency, errors[2], angle, apart[:, 2 + S.THETA].max()])
+        self.largest_s = np.where(window_errors > self.errors, times_s[0], self.largest_s)
         self.errors = np.maximum(self.errors, window_errors)
         errors_by_name, tolerances = dict(zip(QUANTITIES, self.errors, strict=True)), self._tolerances()
         exceeded = [

@@ -66,7 +66,7 @@ def test_an_error_is_of_its_quantity(off: dict[str, float], exceeded: list[str],
     [
         ({"angle": 0.02}, {}, None),
         ({"angle": 0.02}, {"angle": 2.0}, None),
-        ({"angle": 0.02}, {"angle": 0.5}, "whirl angle off by 1.1 deg (limit 0.5) since 0.000 s;"),
+        ({"angle": 0.02}, {"angle": 0.5}, "whirl angle off by 1.1 deg (limit 0.5) since 0.000 s, largest at 0.000 s;"),
         ({"radius": 0.2e-6}, {"radius": 0.1}, "whirl radius off by 0.2 um (limit 0.1) since"),
         ({"radius": 0.4e-6}, {"radius": 0.5}, None),
         ({"radius": 0.4e-6}, {"angle": 0.5}, "whirl radius off by 0.4 um (tolerance 0.28) since"),
@@ -109,7 +109,9 @@ def test_an_unfinished_window_counts_and_changes_nothing() -> None:
     accuracy = Accuracy(3e-4, CLEARANCE, 1e-3)
     assert accuracy.compare(make_whirl(10), make_whirl(10, radius=1e-6), 1e-3 * np.arange(10)) == []
     before = copy.deepcopy(accuracy)
-    assert "whirl radius off by 1 um (tolerance 0.28)" in accuracy.copy_completed().warning()
+    warning = accuracy.copy_completed().warning()
+    assert "whirl radius off by 1 um (tolerance 0.28)" in warning
+    assert "engine.tolerance is now 0.0003, try 3e-05" in warning
     assert np.array_equal(accuracy.errors, before.errors)
 
 

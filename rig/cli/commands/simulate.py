@@ -19,7 +19,7 @@ def simulate(
     scene_changes: SceneChanges,
     check: Annotated[
         bool,
-        typer.Option("--check", help="Repeat with finer steps, print the error; status 1 if suspect"),
+        typer.Option("--check", help="Compare the run with another engine; status 1: suspect, 3: unknown"),
     ] = False,
     force: Force = False,
 ) -> None:
@@ -35,9 +35,10 @@ def simulate(
         check_run_output(output, force=force)
         loaded = load_scene(scene, scene_changes.overrides())
         if check:
-            from replays.studies.check import refine
+            from replays.studies.check import check as check_run
+            from replays.studies.check import choose_reference, sample_rows
 
-            refine(loaded)  # raises its errors before a long run
+            choose_reference(loaded)  # raises its errors before a long run
 
         from rig.run.simulation import Simulation
 
@@ -48,7 +49,9 @@ def simulate(
             simulation.warm_up()
     with reporting() as reporter:
         begin = time.perf_counter()
-        write_run(simulation, output, force=force, progress=lambda part: reporter.part(part, scene))
+        rows: list[Any] = []
+        observe = (lambda frame: rows.append(sample_rows(simulation, frame))) if check else (lambda _frame: None)
+        write_run(simulation, output, force=force, progress=lambda part: reporter.part(part, scene), observe=observe)
     seconds = simulation.tick / simulation.tick_rate_hz
     factor = seconds / (time.perf_counter() - begin)
     health = simulation.health()
@@ -59,13 +62,14 @@ def simulate(
     for warning in health["warnings"]:
         echo(f"warning: {warning}", err=True)
     if check:
-        from replays.studies.check import check as check_scene
-
-        checked = check_scene(loaded)
-        if checked.wrong_branch:
-            echo(f"warning: {checked.line()}", err=True)
-            raise typer.Exit(1)
-        echo(f"checked: {checked.line()}")
+        with reporting(compiles=True) as reporter:
+            reporter.show_activity("reference run")
+            checked = check_run(simulation, rows)
+        if checked.informs and not checked.wrong_branch:
+            echo(f"checked {checked.line()}")
+            return
+        echo(f"warning: {checked.line()}", err=True)
+        raise typer.Exit(1 if checked.informs else 3)
 
 
 def _moved(health: dict[str, Any]) -> str:
