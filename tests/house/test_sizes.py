@@ -37,16 +37,21 @@ BUDGETS = {
     "replays/campaigns": 2529,
     "replays/estimate": 332,
     "replays/player": 816,
-    "replays/recordings": 10232,
+    "replays/recordings": 10238,
     "replays/report": 475,
     "replays/score": 4164,
     "replays/sessions": 73,
-    "replays/studies": 8890,
+    "replays/studies": 8927,
     "rig": 53,
     "rig/base": 920,
     "rig/channels": 2417,
+<<<<<<< HEAD
     "rig/cli": 5185,
     "rig/physics": 5453,
+=======
+    "rig/cli": 5173,
+    "rig/physics": 5456,
+>>>>>>> 8ae5b62b (Budgets for the check by another engine)
     "rig/run": 1819,
     "rig/serve": 2849,
 }

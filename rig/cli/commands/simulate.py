@@ -30,14 +30,13 @@ def simulate(
 
     with reduce_garbage_collections():
         from replays.recordings.export import check_run_output, write_run
+        from replays.studies.check import check as check_run
+        from replays.studies.check import choose_reference, sample_rows
         from rig.run.scenes import load_scene
 
         check_run_output(output, force=force)
         loaded = load_scene(scene, scene_changes.overrides())
         if check:
-            from replays.studies.check import check as check_run
-            from replays.studies.check import choose_reference, sample_rows
-
             choose_reference(loaded)  # raises its errors before a long run
 
         from rig.run.simulation import Simulation
