@@ -45,13 +45,8 @@ BUDGETS = {
     "rig": 53,
     "rig/base": 920,
     "rig/channels": 2417,
-<<<<<<< HEAD
-    "rig/cli": 5185,
-    "rig/physics": 5453,
-=======
-    "rig/cli": 5173,
+    "rig/cli": 5190,
     "rig/physics": 5456,
->>>>>>> 8ae5b62b (Budgets for the check by another engine)
     "rig/run": 1819,
     "rig/serve": 2849,
 }
