@@ -161,11 +161,11 @@ class Trial:
         folder = self.folder if self.evidence is None else self.evidence / folder_name(self.id)
         folder.mkdir(parents=True, exist_ok=True)
         # Logs and files of devices; an excerpt replaces the recorded session.
-        for left in sorted(self.folder.iterdir()):
-            if left.is_file() and left.suffix != ".mcap" and left.stat().st_size < _MAX_EVIDENCE_BYTES:
+        for file in sorted(self.folder.iterdir()):
+            if file.is_file() and file.suffix != ".mcap" and file.stat().st_size < _MAX_EVIDENCE_BYTES:
                 if folder != self.folder:
-                    shutil.copyfile(left, folder / left.name)
-                self.kept.append(folder / left.name)
+                    shutil.copyfile(file, folder / file.name)
+                self.kept.append(folder / file.name)
         try:
             if self.recording is not None:
                 self.kept += self._cut(self.recording, folder)

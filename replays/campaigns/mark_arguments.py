@@ -26,13 +26,13 @@ class _Marker(Written):
     can: bool = False
 
 
-def read_settings(given: dict[str, Any]) -> BenchSettings:
+def read_settings(arguments: dict[str, Any]) -> BenchSettings:
     """Return bench settings from the arguments of the marker.
 
     Raises:
         InputError: If an argument is invalid; the message names the first one.
     """
-    args = check(_Marker, given, field="bench")
+    args = check(_Marker, arguments, field="bench")
     faults = [{"at_s": 0.0, **each, "command": "fault"} for each in args.faults]
     timed = tuple(
         check(TimedCommand, each, field=f"bench.{field}.{n}")

@@ -165,11 +165,11 @@ class Measurement:
         """Return the measurement as JUnit properties."""
         document = self.document()
         value = "nothing" if document["value"] is None else f"{document['value']:.9g}"
-        found = [(self.name, with_unit(value, self.must.unit)), (f"{self.name}.limit", str(self.must))]
+        pairs = [(self.name, with_unit(value, self.must.unit)), (f"{self.name}.limit", str(self.must))]
         if document["margin"] is not None:
-            found += [(f"{self.name}.margin", with_unit(f"{document['margin']:.6g}", self.must.unit))]
+            pairs += [(f"{self.name}.margin", with_unit(f"{document['margin']:.6g}", self.must.unit))]
         rest = (("source", self.source), ("resolution", self.resolution))
-        return found + [(f"{self.name}.{key}", value) for key, value in rest if value]
+        return pairs + [(f"{self.name}.{key}", value) for key, value in rest if value]
 
 
 def quantity(text: str, unit: str, *, field: str, of: str) -> float:
@@ -178,8 +178,8 @@ def quantity(text: str, unit: str, *, field: str, of: str) -> float:
     Raises:
         InputError: If the text has another form, or its unit is missing or of another kind.
     """
-    number, given = split_quantity(text, field=field)
-    return number * _factor(given, unit, field=field, of=of, text=text)
+    number, unit_of_text = split_quantity(text, field=field)
+    return number * _factor(unit_of_text, unit, field=field, of=of, text=text)
 
 
 def split_quantity(text: str, *, field: str) -> tuple[float, str]:
@@ -194,17 +194,17 @@ def split_quantity(text: str, *, field: str) -> tuple[float, str]:
     return float(match[1]), (match[2] or "1").strip()
 
 
-def _factor(given: str, wanted: str, *, field: str, of: str, text: str) -> float:
-    if (given in _UNITLESS and wanted in _UNITLESS) or units.canonical(given) == units.canonical(wanted):
+def _factor(unit: str, wanted: str, *, field: str, of: str, text: str) -> float:
+    if (unit in _UNITLESS and wanted in _UNITLESS) or units.canonical(unit) == units.canonical(wanted):
         return 1.0
-    if given in _UNITLESS:
+    if unit in _UNITLESS:
         raise InputError(field, f"with a unit, as {of} is in {wanted}", text)
-    if wanted in _UNITLESS or units.get_quantity(given) != units.get_quantity(wanted) or not units.get_quantity(given):
+    if wanted in _UNITLESS or units.get_quantity(unit) != units.get_quantity(wanted) or not units.get_quantity(unit):
         what = units.get_quantity(wanted)
         must = "without a unit" if wanted in _UNITLESS else f"in a unit of {what}" if what else f"in {wanted}"
         tail = "has none" if wanted in _UNITLESS else f"is in {wanted}"
         raise InputError(field, f"{must}, as {of} {tail}", text)
-    return units.size_si(given) / units.size_si(wanted)
+    return units.size_si(unit) / units.size_si(wanted)
 
 
 def with_unit(number: str, unit: str) -> str:

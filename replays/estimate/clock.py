@@ -70,5 +70,5 @@ def time_error(slope: np.ndarray, residual: np.ndarray) -> float:
     Returns:
         Time error [s], or [samples]; 0 if the signal has no slope.
     """
-    known = float(np.sum(slope**2))
-    return float(np.sum(slope * residual)) / known if known > 0.0 else 0.0
+    information = float(np.sum(slope**2))
+    return float(np.sum(slope * residual)) / information if information > 0.0 else 0.0

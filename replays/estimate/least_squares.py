@@ -99,28 +99,28 @@ def fit(
     z = residuals(start)
     if z is None:
         return None
-    found = Fit(start, z, None)
+    state = Fit(start, z, None)
     for _ in range(rounds):
-        tangent = slopes(found.values, found.residuals)
+        tangent = slopes(state.values, state.residuals)
         if tangent is None or not tangent.any():
             break
-        step = np.clip(np.linalg.lstsq(tangent, -found.residuals, rcond=None)[0], -longest, longest)
-        found = found._replace(slopes=tangent)
-        better = _search_step(residuals, found, step, farthest)
+        step = np.clip(np.linalg.lstsq(tangent, -state.residuals, rcond=None)[0], -longest, longest)
+        state = state._replace(slopes=tangent)
+        better = _search_step(residuals, state, step, farthest)
         if better is None:
             break
-        before, found = found, better
-        small = float(np.sum((tangent @ (found.values - before.values)) ** 2)) < _MIN_SQUARES_CHANGE
-        if small or found.squares > (1.0 - gain) * before.squares:
+        before, state = state, better
+        small = float(np.sum((tangent @ (state.values - before.values)) ** 2)) < _MIN_SQUARES_CHANGE
+        if small or state.squares > (1.0 - gain) * before.squares:
             break
-    return found
+    return state
 
 
-def _search_step(residuals: Residuals, found: Fit, step: np.ndarray, farthest: float | np.ndarray) -> Fit | None:
+def _search_step(residuals: Residuals, state: Fit, step: np.ndarray, farthest: float | np.ndarray) -> Fit | None:
     """Return the first fraction of a step that decreases the sum of squares, or None."""
     for part in _STEP_FACTORS:
-        values = np.clip(found.values + part * step, -farthest, farthest)
+        values = np.clip(state.values + part * step, -farthest, farthest)
         ahead = residuals(values)
-        if ahead is not None and ahead @ ahead < found.squares:
-            return found._replace(values=values, residuals=ahead)
+        if ahead is not None and ahead @ ahead < state.squares:
+            return state._replace(values=values, residuals=ahead)
     return None

@@ -42,17 +42,17 @@ class Edit:
         self._truth = truth
         self._columns: dict[str, list[int]] = {}
         self._dropped: set[str] = set()
-        known = [
+        valid_keys = [
             *map(wire.sensor_key, table.groups),
             *map(wire.truth_key, catalogue.get("truth", {})),
             *(wire.EDGES, wire.EVENTS, wire.STATUS),
         ]
         for old, new in self._keys.items():
-            if old not in known:
-                raise InputError("remap", f"from one of {', '.join(known)}", old)
+            if old not in valid_keys:
+                raise InputError("remap", f"from one of {', '.join(valid_keys)}", old)
             if not new.startswith(f"{wire.ROOT}/") or wire.get_schema(new) != wire.get_schema(old):
                 raise InputError("remap", f"to a key for the same kind of payload as {old}", new)
-        after = [self._keys.get(key, key) for key in known]
+        after = [self._keys.get(key, key) for key in valid_keys]
         for key in after:
             if after.count(key) > 1:
                 raise InputError("remap", "to a key that nothing else has", key)

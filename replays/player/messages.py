@@ -82,6 +82,6 @@ class Track:
 
     def _commands(self) -> list[dict[str, Any]]:
         fields = ("id", "tick", "command", "request")
-        found = [entry for part in self._recording.parts for entry in part.scene.get("taken", [])]
-        found += [event for event in self._recording.events if event.get("event") == "command"]
-        return [{name: entry[name] for name in fields} for entry in found if all(name in entry for name in fields)]
+        entries = [entry for part in self._recording.parts for entry in part.scene.get("taken", [])]
+        entries += [event for event in self._recording.events if event.get("event") == "command"]
+        return [{name: entry[name] for name in fields} for entry in entries if all(name in entry for name in fields)]

@@ -204,11 +204,11 @@ class Player(ServedRun):
         return warnings
 
     def _scene_document(self) -> dict[str, Any]:
-        taken = {entry["id"]: entry for entry in self._scene.get("taken", ())}
+        commands_by_id = {entry["id"]: entry for entry in self._scene.get("taken", ())}
         for entry in self._track.commands:
             if entry["tick"] * NS < self._position_ns * self._rate and entry["command"] not in _ACCEPTED_COMMANDS:
-                taken.setdefault(entry["id"], entry)
-        commands = {"taken": list(taken.values())} if taken or "taken" in self._scene else {}
+                commands_by_id.setdefault(entry["id"], entry)
+        commands = {"taken": list(commands_by_id.values())} if commands_by_id or "taken" in self._scene else {}
         return {**self._scene, **commands, **({} if self._as_recorded else {"replayed": "in part, or changed"})}
 
     def _wake(self) -> None:

@@ -131,10 +131,10 @@ def axis_label(name: str, unit: str) -> str:
 
 def add_legend(figure: Figure, *panels: Any, columns: int = 4) -> None:
     """Draw one legend for some panels, or all, below the figure; each name occurs once."""
-    found = {}
+    handles = {}
     for axes in panels or figure.axes:
-        found |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns)
+        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
 def check_suffix(path: Path, *, field: str = "picture") -> None:
@@ -221,9 +221,9 @@ def _apply_palette(image: Image) -> Image:
     means = np.rint(means)
     indices = np.zeros(1 << 24, np.uint8)
     indices[colours @ _CHANNEL_WEIGHTS] = _nearest(colours, means)
-    found = Image.fromarray(indices[np.asarray(image, dtype=np.int32) @ _CHANNEL_WEIGHTS])
-    found.putpalette(means.astype(np.uint8).tobytes())
-    return found
+    paletted = Image.fromarray(indices[np.asarray(image, dtype=np.int32) @ _CHANNEL_WEIGHTS])
+    paletted.putpalette(means.astype(np.uint8).tobytes())
+    return paletted
 
 
 def _nearest(colours: np.ndarray, means: np.ndarray) -> np.ndarray:

@@ -29,12 +29,12 @@ Style = Literal["", "code", "sub", "sup"]
 def fragments(text: str) -> list[tuple[str, Style]]:
     """Split a text into fragments and their styles: code in backticks, subscripts in _{}, superscripts in ^{}."""
     styles: tuple[Style, ...] = ("", "code", "sub", "sup")
-    found: list[tuple[str, Style]] = []
+    pieces: list[tuple[str, Style]] = []
     for n, piece in enumerate(_MARKUP.split(text)):
         style = styles[n % len(styles)]
         if piece:
-            found.append((piece if style else piece.replace("m/s^2", "m/s²"), style))
-    return found
+            pieces.append((piece if style else piece.replace("m/s^2", "m/s²"), style))
+    return pieces
 
 
 def strip_styles(text: str) -> str:
@@ -88,11 +88,11 @@ class Table:
     def tails(self) -> tuple[tuple[str, ...], ...]:
         """Characters to append to plain numbers so that all decimal points of a column line up, by row."""
         columns = [[_PLAIN_NUMBER.fullmatch(row.cells[n]) for row in self.rows] for n in range(len(self.headings))]
-        decimals = [[match[1] or "" if match else None for match in found] for found in columns]
-        longest = [max((each for each in found if each is not None), key=len, default="") for found in decimals]
+        decimals = [[match[1] or "" if match else None for match in digits] for digits in columns]
+        longest = [max((each for each in digits if each is not None), key=len, default="") for digits in decimals]
         tails = [
-            ["" if each is None or not numeric else ("." + "0" * len(most))[len(each) : len(most)] for each in found]
-            for found, most, numeric in zip(decimals, longest, self.numeric, strict=True)
+            ["" if each is None or not numeric else ("." + "0" * len(most))[len(each) : len(most)] for each in digits]
+            for digits, most, numeric in zip(decimals, longest, self.numeric, strict=True)
         ]
         return tuple(zip(*tails, strict=True))
 
@@ -151,8 +151,8 @@ class Report:
         Raises:
             ValueError: If a row has another length.
         """
-        given = (row if isinstance(row, Row) else Row(tuple(row)) for row in rows)
-        whole = tuple(Row(tuple(map(printable, row.cells)), row.mark) for row in given)
+        styled = (row if isinstance(row, Row) else Row(tuple(row)) for row in rows)
+        whole = tuple(Row(tuple(map(printable, row.cells)), row.mark) for row in styled)
         for row in whole:
             if len(row.cells) != len(headings):
                 raise ValueError(f"row must have {len(headings)} cells; received {row.cells}")

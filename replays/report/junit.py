@@ -88,9 +88,9 @@ def write_junit(path: Path, suites: Sequence[Suite], *, name: str = "") -> None:
 
 
 def _counts(cases: Sequence[JunitCase]) -> dict[str, str]:
-    found = Counter(case.outcome for case in cases)
-    errors = found["error"] + found["inconclusive"]
-    totals = {"tests": len(cases), "failures": found["failure"], "errors": errors, "skipped": found["skipped"]}
+    counts = Counter(case.outcome for case in cases)
+    errors = counts["error"] + counts["inconclusive"]
+    totals = {"tests": len(cases), "failures": counts["failure"], "errors": errors, "skipped": counts["skipped"]}
     return {**{key: str(count) for key, count in totals.items()}, "time": _seconds(sum(case.time_s for case in cases))}
 
 

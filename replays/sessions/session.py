@@ -66,9 +66,9 @@ def make(
     recording, text = folder / f"{session.name}.mcap", folder / f"{session.name}.toml"
     step(session.name)
     _record(session, recording)
-    found = validate(Recording.open(recording), declared=True)
+    validation = validate(Recording.open(recording), declared=True)
     with whole_file(text) as draft:
-        draft.write_text(quantities_text(session, found), encoding="utf-8")
+        draft.write_text(quantities_text(session, validation), encoding="utf-8")
     return recording, text
 
 
@@ -79,14 +79,14 @@ def _record(session: ReferenceSession, path: Path) -> None:
             writer.write(frame)
 
 
-def quantities_text(session: ReferenceSession, found: Validation) -> str:
+def quantities_text(session: ReferenceSession, validation: Validation) -> str:
     """Return the quantities of a session as TOML, by phase, as its sensors show them (energies: the truth)."""
     lines = [
         f"# Quantities of {session.name}.mcap, read off the recording; made with it by `{COMMAND}`.",
         f"# Scene {session.scene} with {', '.join(f'{key} = {value}' for key, value in session.changes.items())}.",
         "# Five digits are written: another machine may differ in the last ones, and more in a chaotic phase.",
     ]
-    for number, phase in enumerate(found.phases):
+    for number, phase in enumerate(validation.phases):
         lines += [
             "",
             "[[phases]]",
@@ -94,7 +94,7 @@ def quantities_text(session: ReferenceSession, found: Validation) -> str:
             f"from_s = {phase.from_s:.5g}",
             f"to_s = {phase.to_s:.5g}",
         ]
-        for one in found.statistics:
+        for one in validation.statistics:
             if one.number == number and not one.quantity.startswith("spectrum"):
                 unit = f"  # {one.unit}" if one.unit else ""
                 lines.append(f"{one.quantity} = {one.recorded:.5g}{unit}")

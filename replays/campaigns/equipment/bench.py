@@ -259,8 +259,8 @@ class Bench(Closing):
         now: list[str] = []
         for _ in Deadline(timeout_s).polls():
             now = self.joined
-            if found := next(filter(fits, now), None):
-                return found
+            if device_name := next(filter(fits, now), None):
+                return device_name
             look()
         others = ", ".join(now) or "none"
         raise BenchError(f"device {device} did not join within {timeout_s:g} s; joined devices: {others}")
@@ -274,10 +274,10 @@ class Bench(Closing):
         client = self._console
         if self.pace != "lockstep":
             deadline = Deadline(10.0 + 2.0 * max(0.0, time_s - client.status()["time_s"]))
-            while (left := time_s - (status := client.status())["time_s"]) > 0.0 and status["state"] != "ended":
+            while (remaining_s := time_s - (status := client.status())["time_s"]) > 0.0 and status["state"] != "ended":
                 if deadline.passed:
                     raise BenchError(f"the rig did not reach {time_s:g} s")
-                time.sleep(min(0.2, max(0.002, left)))
+                time.sleep(min(0.2, max(0.002, remaining_s)))
             return
         status = client.status()
         tick, block, end_s = status["tick"], _to_ticks(1e-3 * status["block_ms"]), status["end_s"]

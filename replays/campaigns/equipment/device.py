@@ -135,8 +135,8 @@ def check_program(words: Sequence[str], where: Path, *, field: str) -> None:
     if not words:
         raise InputError(field, "a command line", "")
     beside = str(Path(sys.executable).parent)
-    found = shutil.which(words[0]) or shutil.which(words[0], path=beside) or (where / words[0]).is_file()
-    if not found:
+    program = shutil.which(words[0]) or shutil.which(words[0], path=beside) or (where / words[0]).is_file()
+    if not program:
         raise InputError(field, "a program that there is", words[0])
     scripts = [word for word in words[1:2] if word.endswith(".py")]
     if scripts and not (where / scripts[0]).is_file():

@@ -43,10 +43,10 @@ def _check_name(text: str) -> str:
     return text
 
 
-def _check_quantity(given: Any) -> str:
-    if not isinstance(given, str):
+def _check_quantity(text: Any) -> str:
+    if not isinstance(text, str):
         raise ValueError("a number with its unit as a text, such as '0.2 mm'")
-    return given
+    return text
 
 
 Quantity = Annotated[str, BeforeValidator(_check_quantity)]
@@ -143,9 +143,9 @@ class Campaign:
 
 def find_shipped() -> dict[str, Path]:
     """Return the files of the shipped campaigns, in TOML or for pytest, by name."""
-    found = {file.name.removesuffix(SUFFIX): file for file in FOLDER.glob(f"*{SUFFIX}")}
-    found |= {file.stem.removeprefix("test_").replace("_", "-"): file for file in FOLDER.glob("test_*.py")}
-    return dict(sorted(found.items()))
+    files = {file.name.removesuffix(SUFFIX): file for file in FOLDER.glob(f"*{SUFFIX}")}
+    files |= {file.stem.removeprefix("test_").replace("_", "-"): file for file in FOLDER.glob("test_*.py")}
+    return dict(sorted(files.items()))
 
 
 def read_title(path: Path) -> str:
@@ -162,10 +162,10 @@ def campaign_path(name_or_path: str) -> Path:
     Raises:
         UnknownNameError: If the argument looks like a name but is neither a shipped campaign nor a file.
     """
-    known, path = find_shipped(), Path(name_or_path)
-    if name_or_path not in known and re.fullmatch(r"[\w-]+", name_or_path) and not path.exists():
-        raise UnknownNameError("FILE", "a file or a shipped campaign", name_or_path, known)
-    return known.get(name_or_path, path)
+    shipped, path = find_shipped(), Path(name_or_path)
+    if name_or_path not in shipped and re.fullmatch(r"[\w-]+", name_or_path) and not path.exists():
+        raise UnknownNameError("FILE", "a file or a shipped campaign", name_or_path, shipped)
+    return shipped.get(name_or_path, path)
 
 
 def load_campaign(path: Path, device: str | None = None, limits: Sequence[str] = ()) -> Campaign:
@@ -273,16 +273,16 @@ def _shorten(value: Any) -> str:
 
 
 def _fault_name(fault: Mapping[str, Any], number: int) -> str:
-    given = fault.get("id", "-".join(str(fault[key]) for key in ("channel", "kind") if key in fault))
-    if not isinstance(given, str) or not re.fullmatch(r"[\w.+-]+", given):
-        raise InputError(f"matrix.fault.{number}.id", "a name of letters, digits, dots and dashes", given or None)
-    return given
+    name = fault.get("id", "-".join(str(fault[key]) for key in ("channel", "kind") if key in fault))
+    if not isinstance(name, str) or not re.fullmatch(r"[\w.+-]+", name):
+        raise InputError(f"matrix.fault.{number}.id", "a name of letters, digits, dots and dashes", name or None)
+    return name
 
 
 def _case(
-    path: Path, file: _File, picked: _Entries, named: Mapping[str, str], name: str, scenes: dict[str, Scene]
+    path: Path, file: _File, entries: _Entries, axis_labels: Mapping[str, str], name: str, scenes: dict[str, Scene]
 ) -> Case:  # fmt: skip
-    values = {axis: value for axis, (_, value) in picked.items()}
+    values = {axis: value for axis, (_, value) in entries.items()}
     scene_name = values.get("scene", file.scene)
     if not scene_name:
         raise InputError("scene", "given, here or in [matrix]", None)
@@ -306,16 +306,16 @@ def _case(
     own = [each.model_dump(exclude_none=True) for each in scene.commands]
     with _field("steps"):
         load_scene(scene_name, {**changes, **({"channels": table} if table else {}), "commands": [*own, *timed]})
-    known: Units = {"": {key: each.unit for key, each in scene.table.channels.items()}, **_TRUTH}
+    units_by_table: Units = {"": {key: each.unit for key, each in scene.table.channels.items()}, **_TRUTH}
     axes = {axis.rpartition(" ")[2]: [label for label, _ in each] for axis, each in _axes(file)}
     devices = tuple(_devices(file, places, path))
     sources = {"note" if step.command is None else "command" for step in steps} | {"command" for _ in own}
     expects = []
     for n, one in enumerate(file.expect):
-        expect = _expect(one, f"expect.{n}", places, known, duration_s)
+        expect = _expect(one, f"expect.{n}", places, units_by_table, duration_s)
         _check_when(expect, f"expect.{n}.when", axes)
         _check_pace(expect, f"expect.{n}", devices if file.pace == "lockstep" else (), sources)
-        if all(named[axis] in labels for axis, labels in _when(expect)):
+        if all(axis_labels[axis] in labels for axis, labels in _when(expect)):
             expects.append(expect)
     if not expects:
         raise InputError("expect", "with something for each case", Words(f"nothing for {name}"))
@@ -323,7 +323,7 @@ def _case(
         scene=scene_name, pace=file.pace, block_ms=file.block_ms, set=changes, table=table, can=file.can
     )
     ordered = tuple(sorted(steps, key=lambda step: step.at_s))
-    return Case(name, file.title, path, bench, duration_s, ordered, devices, tuple(expects), named)
+    return Case(name, file.title, path, bench, duration_s, ordered, devices, tuple(expects), axis_labels)
 
 
 _TRUTH: Units = {
@@ -372,10 +372,10 @@ def _fill_placeholders(value: Any, places: Mapping[str, str], field: str, kept: 
 
 
 def _step(
-    given: Mapping[str, Any], field: str, places: Mapping[str, str], duration_s: float, scene: Scene, file: _File
+    entry: Mapping[str, Any], field: str, places: Mapping[str, str], duration_s: float, scene: Scene, file: _File
 ) -> Step:  # fmt: skip
-    one = _fill_placeholders(dict(given), places, field)
-    for key, text in given.items():
+    one = _fill_placeholders(dict(entry), places, field)
+    for key, text in entry.items():
         if isinstance(text, str) and (match := PLACEHOLDER.fullmatch(text)) and match[2]:
             one[key] = float(one[key])  # a number in a unit
     if "note" in one:
@@ -424,14 +424,14 @@ def _check_fault(request: FaultCommand, field: str, scene: Scene, *, can: bool) 
 
 
 def _expect(
-    given: Mapping[str, Any], field: str, places: Mapping[str, str], known: Units, duration_s: float
+    entry: Mapping[str, Any], field: str, places: Mapping[str, str], units_by_table: Units, duration_s: float
 ) -> Expect:  # fmt: skip
-    kinds = [key for key in KINDS if key in given]
+    kinds = [key for key in KINDS if key in entry]
     if len(kinds) != 1:
-        found = Words(" and ".join(kinds) or "none of them")
-        raise InputError(field, f"about one of {', '.join(KINDS)}", found)
-    expect = check(KINDS[kinds[0]], _fill_placeholders(dict(given), places, field), field=field)
-    expect.check(known, where=field)
+        received = Words(" and ".join(kinds) or "none of them")
+        raise InputError(field, f"about one of {', '.join(KINDS)}", received)
+    expect = check(KINDS[kinds[0]], _fill_placeholders(dict(entry), places, field), field=field)
+    expect.check(units_by_table, where=field)
     times = {name: getattr(expect, name, None) for name in ("from_s", "at_s", "to_s")}
     for name, time_s in times.items():
         if time_s is not None and time_s > duration_s:
@@ -443,8 +443,8 @@ def _expect(
 
 def _when(expect: Expect) -> Iterator[tuple[str, list[str]]]:
     """Yield the axes that restrict an expectation, each with the labels of its values."""
-    for axis, given in expect.when.items():
-        labels = [_shorten(each) for each in (given if isinstance(given, list) else [given])]
+    for axis, values in expect.when.items():
+        labels = [_shorten(each) for each in (values if isinstance(values, list) else [values])]
         short = "" if axis in ("scene", "fault") else f"{axis.rpartition('.')[2]}="
         yield axis, [label if label.startswith(short) else f"{short}{label}" for label in labels]
 

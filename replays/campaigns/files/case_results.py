@@ -77,8 +77,8 @@ class CaseRecording:
         """Return samples of channels, or of a truth table."""
         key = truth, names
         if key not in self._rows:
-            found = self.recording.truth(truth) if truth else self.recording.samples(*names)
-            self._rows[key] = found.select(*names)
+            samples = self.recording.truth(truth) if truth else self.recording.samples(*names)
+            self._rows[key] = samples.select(*names)
         return self._rows[key]
 
     def card(

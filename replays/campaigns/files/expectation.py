@@ -48,15 +48,15 @@ class _SignalFields(Written):
             raise UnknownNameError(f"{where}.truth", "one of the tables of the truth", self.truth, tables)
         if len(self.names) not in (1, 2):
             raise InputError(f"{where}.signal", "a name, or the two of an orbit", list(self.names))
-        known = units[self.truth]
+        signal_units = units[self.truth]
         for name in self.names:
-            if name not in known:
+            if name not in signal_units:
                 what = f"a column of {self.truth}" if self.truth else "one of the channels"
-                raise UnknownNameError(f"{where}.signal", what, name, known)
-        if len({known[name] for name in self.names}) > 1:
-            found = Words(" and ".join(f"{name} in {known[name]}" for name in self.names))
-            raise InputError(f"{where}.signal", "two of one unit", found)
-        return known[self.names[0]]
+                raise UnknownNameError(f"{where}.signal", what, name, signal_units)
+        if len({signal_units[name] for name in self.names}) > 1:
+            received = Words(" and ".join(f"{name} in {signal_units[name]}" for name in self.names))
+            raise InputError(f"{where}.signal", "two of one unit", received)
+        return signal_units[self.names[0]]
 
     def values(self, recording: CaseRecording) -> tuple[np.ndarray, np.ndarray]:
         """Return times from the start of the case [s] and values, for an orbit its radius, each of shape (n,)."""
@@ -107,9 +107,9 @@ class Since(_SignalFields):
         Raises:
             InputError: If it is not, or if the unit of the level is missing or wrong.
         """
-        given = [name for name in ("at_s", "event", "signal") if getattr(self, name) not in (None, "", [])]
-        if len(given) != 1:
-            raise InputError(where, "given by one of at_s, event and signal", Words(" and ".join(given) or "none"))
+        origins = [name for name in ("at_s", "event", "signal") if getattr(self, name) not in (None, "", [])]
+        if len(origins) != 1:
+            raise InputError(where, "given by one of at_s, event and signal", Words(" and ".join(origins) or "none"))
         if self.signal:
             unit = self.unit(units, where=where)
             quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))

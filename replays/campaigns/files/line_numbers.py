@@ -22,7 +22,7 @@ def number_lines(text: str) -> dict[str, int]:
         >>> number_lines('a = 1\n[[b]]\nc = [\n  2,\n  { d = 3 },\n]')
         {'a': 1, 'b': 2, 'b.0': 2, 'b.0.c': 3, 'b.0.c.0': 4, 'b.0.c.1': 5, 'b.0.c.1.d': 5}
     """
-    found: dict[str, int] = {}
+    lines: dict[str, int] = {}
     counts: dict[str, int] = {}
     tokens = _Tokens(text)
     table = ""
@@ -36,15 +36,15 @@ def number_lines(text: str) -> dict[str, int]:
             if several:
                 tokens.next()
                 number = counts[name] = counts.get(name, -1) + 1
-                found.setdefault(name, line)
+                lines.setdefault(name, line)
                 name = f"{name}.{number}"
-            found.setdefault(name, line)
+            lines.setdefault(name, line)
             table = name
             continue
         path = _join_path([table, *tokens.key(("=",), word)])
-        found.setdefault(path, line)
-        _value(tokens, path, found)
-    return found
+        lines.setdefault(path, line)
+        _value(tokens, path, lines)
+    return lines
 
 
 def find_line(field: str, lines: Mapping[str, int]) -> int | None:
@@ -95,16 +95,16 @@ def _join_path(parts: list[str]) -> str:
 
 def _resolve_indices(counts: Mapping[str, int], parts: list[str]) -> list[str]:
     """Return the path of a heading, with the index of the latest table of each enclosing list."""
-    found: list[str] = []
+    levels: list[str] = []
     for number, part in enumerate(parts):
-        found.append(part)
-        name = _join_path(found)
+        levels.append(part)
+        name = _join_path(levels)
         if name in counts and number < len(parts) - 1:
-            found.append(str(counts[name]))
-    return found
+            levels.append(str(counts[name]))
+    return levels
 
 
-def _value(tokens: _Tokens, path: str, found: dict[str, int]) -> None:
+def _value(tokens: _Tokens, path: str, lines: dict[str, int]) -> None:
     """Skip a value and store the lines of its elements."""
     opening = tokens.next()
     if opening is None or opening[0] not in "[{":
@@ -119,5 +119,5 @@ def _value(tokens: _Tokens, path: str, found: dict[str, int]) -> None:
             continue
         inner = f"{path}.{number}" if listed else _join_path([path, *tokens.key(("=",))])
         number += 1
-        found.setdefault(inner, line)
-        _value(tokens, inner, found)
+        lines.setdefault(inner, line)
+        _value(tokens, inner, lines)

@@ -69,11 +69,11 @@ def run_case(case: Case, trial: Trial) -> None:
     trial.recording = record.stop()
     for device in trial.devices:
         end_device(device, trial)
-    seen = CaseRecording(trial.recording, trial.folder, trial.origin_s)
-    _measure_device(seen, trial)
-    measure_end(seen, trial, case)
+    results = CaseRecording(trial.recording, trial.folder, trial.origin_s)
+    _measure_device(results, trial)
+    measure_end(results, trial, case)
     for expect in case.expects:
-        for measurement in expect.measure(seen, seen.units):
+        for measurement in expect.measure(results, results.units):
             exact = measurement.resolution
             # Times that depend on the device have the resolution of its reaction.
             resolution = f"{exact}; {trial.resolution}" if exact and case.devices else exact
@@ -119,26 +119,26 @@ def end_device(device: Device, trial: Trial) -> None:
         trial.take(Measurement(f"exit status of {device.name}", float(status), must, note=note))
 
 
-def measure_end(seen: CaseRecording, trial: Trial, case: Case) -> None:
+def measure_end(results: CaseRecording, trial: Trial, case: Case) -> None:
     """Add a failed measurement if the run was stopped early although no expectation allows it."""
-    ended = next(((at_s, event) for at_s, event in seen.events if event["event"] == "end"), None)
+    ended = next(((at_s, event) for at_s, event in results.events if event["event"] == "end"), None)
     if ended is None or ended[1].get("reason") == "completed" or ended[0] >= case.duration_s - 1e-6:
         return
     if not any(event.event == "end" or event.where.get("command") == "stop" for event in expected_events(case.expects)):
         at_s, event = ended
-        by = next((event["from"] for _, event in seen.events if event.get("command") == "stop"), "")
+        by = next((event["from"] for _, event in results.events if event.get("command") == "stop"), "")
         note = f"{event.get('reason')}{f' by {by}' if by else ''}, before the case was over"
         trial.take(Measurement("end of the run", at_s, Must(">=", case.duration_s, "s"), note=note, at_s=at_s))
 
 
-def _measure_device(seen: CaseRecording, trial: Trial) -> None:
+def _measure_device(results: CaseRecording, trial: Trial) -> None:
     """Add a measurement for each device in lockstep: it fails, with the rig's reason, if the device was lost."""
     for device in trial.devices:
         lost = EventOf(event="device", where={"device": device.rig_name, "state": "lost"})
-        times_s = lost.times_s(seen)
+        times_s = lost.times_s(results)
         if trial.bench is not None and trial.bench.pace == "lockstep":
             reasons = [
-                str(event.get("reason", "")) for _, event in seen.events
+                str(event.get("reason", "")) for _, event in results.events
                 if (event.get("event"), event.get("device"), event.get("state")) == ("device", device.rig_name, "lost")
             ]  # fmt: skip
             at_s = times_s[0] if times_s else None

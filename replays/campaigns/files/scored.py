@@ -54,9 +54,9 @@ class ExpectScore(Expected):
         from replays.score.card.limits import load_limits
         from replays.score.card.scorecard import QUANTITIES
 
-        known = {quantity: about for quantities in QUANTITIES.values() for quantity, about in quantities.items()}
-        if self.score not in {*known, "all"}:
-            raise UnknownNameError(f"{where}.score", "a quantity of `rig score`, or all", self.score, sorted(known))
+        scores = {quantity: about for quantities in QUANTITIES.values() for quantity, about in quantities.items()}
+        if self.score not in {*scores, "all"}:
+            raise UnknownNameError(f"{where}.score", "a quantity of `rig score`, or all", self.score, sorted(scores))
         load_limits(self.limits)
         for name, usual in (("begins_s", 0.0), ("ends_s", 0.0), ("every", 1)):
             if self.score != "all" and getattr(self, name) != usual:
@@ -68,34 +68,34 @@ class ExpectScore(Expected):
             return Must("==", 0.0, "1")
         if self.score in ("all", "recorded", "mapping", "polarity"):
             raise InputError(f"{where}.must", f"left out where score is {self.score}", self.must)
-        if not (unit := known[self.score].unit or units[""].get(" ".join(self._channels), "")):
+        if not (unit := scores[self.score].unit or units[""].get(" ".join(self._channels), "")):
             what = f"one of the channels with must, as {self.score} is in the unit of its channel"
             raise UnknownNameError(f"{where}.channel", what, " ".join(self._channels), units[""])
         return parse_limit(self.must, unit, where=where, of=self.score)
 
-    def measure(self, seen: CaseRecording, units: Units) -> Iterator[Measurement]:
+    def measure(self, case: CaseRecording, units: Units) -> Iterator[Measurement]:
         """Yield a measurement per failing or inconclusive row, or one for all rows."""
         from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS
 
         must = self.check(units, where="expect")
         what = self.name or " ".join(("failing rows of", self.score, *self._channels))
         try:
-            card = seen.card(self.file, self.limits, self.path, self.channels)
+            card = case.card(self.file, self.limits, self.path, self.channels)
         except InputError as error:
             yield Measurement(what, math.nan, must, self.source, note=str(error))
             return
-        rows = list(self._select_rows(card, seen))
+        rows = list(self._select_rows(card, case))
         if self.must:
             yield from self._values(rows, must)
             return
-        found = list(self._losses(card, rows, seen)) if self.score == "all" else []
+        judged = list(self._losses(card, rows, case)) if self.score == "all" else []
         for row in rows:
             # A single quantity must have a verdict; with `all`, some quantities never have one.
             if row.verdict == FAIL or (row.verdict == INCONCLUSIVE and self.score != "all"):
                 text = " ".join(filter(None, (*row.cells(), row.note)))
-                found.append((row.channel, text, Outcome(row.verdict)))
-        failing = [(channel, text) for channel, text, outcome in found if outcome is Outcome.FAIL]
-        reasons = [text for _, text, outcome in found if outcome is Outcome.INCONCLUSIVE]
+                judged.append((row.channel, text, Outcome(row.verdict)))
+        failing = [(channel, text) for channel, text, outcome in judged if outcome is Outcome.FAIL]
+        reasons = [text for _, text, outcome in judged if outcome is Outcome.INCONCLUSIVE]
         reasons += card.evidence_gaps if self.score == "all" else []
         limits = [row.limit.source for row in rows if row.verdict == FAIL and row.limit is not None]
         shown, hidden = (sum(row.verdict == verdict for row in rows) for verdict in (PASS, INCONCLUSIVE))
@@ -105,13 +105,13 @@ class ExpectScore(Expected):
         yield Measurement(
             what, float(len(failing)), must, self.source or ", ".join(dict.fromkeys(limits)),
             note="; ".join([text for _, text in failing][:4]) or note,
-            channels=tuple(channel for channel, _, _ in found if channel)[:2],
+            channels=tuple(channel for channel, _, _ in judged if channel)[:2],
             open_reason="" if failing else "; ".join(reasons[:4]),
         )  # fmt: skip
 
-    def _select_rows(self, card: Scorecard, seen: CaseRecording) -> Iterator[ScoreRow]:
+    def _select_rows(self, card: Scorecard, case: CaseRecording) -> Iterator[ScoreRow]:
         """Yield the rows of the quantity that concern the channels or their groups."""
-        groups = _sent_channels(seen)
+        groups = _sent_channels(case)
         wanted = {name for each in self._channels for name in (each, *groups.get(each, ()))}
         wires = {row.channel: str(row.value) for row in card.rows if row.quantity == "mapping"}
         for row in card.rows:
@@ -120,30 +120,30 @@ class ExpectScore(Expected):
             if self.score in ("all", row.quantity) and (not wanted or own & wanted):
                 yield row
 
-    def _losses(self, card: Scorecard, rows: list[ScoreRow], seen: CaseRecording) -> Iterator[tuple[str, str, Outcome]]:
+    def _losses(self, card: Scorecard, rows: list[ScoreRow], case: CaseRecording) -> Iterator[tuple[str, str, Outcome]]:
         """Yield channel (if known), text and outcome of sent data that are not shown to be in the record."""
         from replays.score.card.scorecard import INCONCLUSIVE, PASS
 
-        groups = _sent_channels(seen)
+        groups = _sent_channels(case)
         wires = {row.value: row for row in card.rows if row.quantity == "mapping"}
-        found = {row.channel for row in card.rows if row.quantity == "recorded" and row.verdict == PASS}
+        recorded = {row.channel for row in card.rows if row.quantity == "recorded" and row.verdict == PASS}
         for name in [name for each in self._channels or groups for name in groups.get(each, [each])]:
             wire = wires.get(name)
             if wire is None:
-                if name in found:  # otherwise `recorded` fails already, or the channel was not to be recorded
+                if name in recorded:  # otherwise `recorded` fails already, or the channel was not to be recorded
                     yield name, f"no data of {name} are in the file", Outcome.FAIL
             elif wire.verdict == INCONCLUSIVE:
                 text = f"whether {wire.channel} is {name} is inconclusive; to find out, run {wire.run}"
                 yield name, text, Outcome.INCONCLUSIVE
             elif not any(row.verdict == PASS for row in rows if row.channel == wire.channel and row is not wire):
                 yield name, f"no quantity of {name} has a verdict", Outcome.INCONCLUSIVE
-        granted_s = {"rows before the first": seen.origin_s + self.begins_s, "rows after the last": self.ends_s}
+        granted_s = {"rows before the first": case.origin_s + self.begins_s, "rows after the last": self.ends_s}
         for row in rows:
             about = f"{row.quantity} of {row.channel}: {row.cells()[2]}"
             if row.quantity == "row step" and row.value != self.every:
                 yield "", f"{about}, not {self.every}", Outcome.FAIL
             elif row.quantity in granted_s:
-                table = seen.recording.table.groups
+                table = case.recording.table.groups
                 rate_hz = max(table[name].rate_hz for name in groups if name in row.channel or "all" in row.channel)
                 if float(row.value) * self.every / rate_hz > granted_s[row.quantity] + 1e-9:
                     yield "", about, Outcome.FAIL
@@ -163,7 +163,7 @@ class ExpectScore(Expected):
             yield Measurement(what, math.nan, must, self.source, open_reason="the scorecard has no such quantity")
 
 
-def _sent_channels(seen: CaseRecording) -> dict[str, tuple[str, ...]]:
+def _sent_channels(case: CaseRecording) -> dict[str, tuple[str, ...]]:
     """Return the channels that were sent, by group."""
-    groups = seen.recording.table.groups
-    return {name: tuple(group.names) for name, group in groups.items() if sensor_key(name) in seen.recording.streams}
+    groups = case.recording.table.groups
+    return {name: tuple(group.names) for name, group in groups.items() if sensor_key(name) in case.recording.streams}

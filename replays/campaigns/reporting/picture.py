@@ -46,9 +46,9 @@ def draw(
         origin_s: Simulated time at which the test began [s].
         about_s: Simulated time around which the excerpt was cut [s].
     """
-    known = recording.table.channels
-    panels = dict.fromkeys(names for each in judged if (names := tuple(n for n in each.channels if n in known)))
-    panels = list(panels)[:_MAX_PANELS] or [(name,) for name in list(known)[:2]]
+    table = recording.table.channels
+    panels = dict.fromkeys(names for each in judged if (names := tuple(n for n in each.channels if n in table)))
+    panels = list(panels)[:_MAX_PANELS] or [(name,) for name in list(table)[:2]]
     rate = recording.catalogue["tick_rate_hz"]
     events = [
         event
@@ -72,9 +72,9 @@ def draw(
             panel.axvline(time_s, color=ORANGE, lw=1.0, ls=":")
             panel.annotate(numbers, (time_s, 1.0), xycoords=("data", "axes fraction"), fontsize=8, va="bottom")
         for each in [each for each in judged if each.channels] or judged[:1]:
-            if not each.channels or tuple(name for name in each.channels if name in known) == names:
-                _mark(panel, each, known[names[0]].unit)
-        panel.set(xlabel="test time [s]", ylabel=axis_label(label, known[names[0]].unit))
+            if not each.channels or tuple(name for name in each.channels if name in table) == names:
+                _mark(panel, each, table[names[0]].unit)
+        panel.set(xlabel="test time [s]", ylabel=axis_label(label, table[names[0]].unit))
     if not any(each.at_s is not None for each in judged) and judged:
         axes[0].axvline(about_s - origin_s, color=RED, lw=1.2, label="end")
     listed.axis("off")

@@ -243,11 +243,11 @@ def shift_by_edges(
     Raises:
         InputError: A signal has no edge, or the shift exceeds within_s.
     """
-    found = [find_crossings(*signal, threshold=threshold, hysteresis=None)[0] for signal in (reference, shifted)]
-    if not len(found[0]) or not len(found[1]):
+    edges = [find_crossings(*signal, threshold=threshold, hysteresis=None)[0] for signal in (reference, shifted)]
+    if not len(edges[0]) or not len(edges[1]):
         must = "an edge through the threshold in both signals"
-        raise InputError("align", must, Words(f"{len(found[0])} in the reference, {len(found[1])} in the moved signal"))
-    a, b = found
+        raise InputError("align", must, Words(f"{len(edges[0])} in the reference, {len(edges[1])} in the moved signal"))
+    a, b = edges
     if len(a) == len(b) > 1:
         line = fit_line(b, a)
         stretch, offset, residual = line.slope, line.at_zero, _jitter(line)[1]

@@ -245,8 +245,8 @@ def _range(signals: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse
     pulses: tuple[HammerPulse, ...] = ()
     if mapping.hammer is not None:
         hammer = next(entry for entry in signals if entry.name == "hammer")
-        found, passed_over = find_pulses(hammer.values, hammer.axis, mapping.hammer)
-        pulses = tuple(pulse for pulse in found if low <= pulse.at_s <= high)
+        all_pulses, passed_over = find_pulses(hammer.values, hammer.axis, mapping.hammer)
+        pulses = tuple(pulse for pulse in all_pulses if low <= pulse.at_s <= high)
         if not pulses:
             largest = float(np.nanmax(hammer.values))
             raise InputError("hammer.threshold_n", f"below the largest force, {largest:.3g} N, in what is imported",
@@ -277,15 +277,15 @@ def _edges(log: Log, zero_s: float, groups: dict[str, PlacedGroup]) -> np.ndarra
     source, entry = log.find(wanted, "keyphasor")
     signal, axis = log.read(source, entry, "keyphasor")
     values, axis = signal.physical, log.align_clock(axis, source, entry)
-    found, level = clock.find_crossings(
+    edges_s, level = clock.find_crossings(
         values, axis, threshold=wanted.threshold, hysteresis=wanted.hysteresis, falling=wanted.edge == "falling"
     )
-    if not len(found):
+    if not len(edges_s):
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
         raise InputError("keyphasor.threshold", f"between {low:.4g} and {high:.4g}, the ends of {entry.name}", level)
-    found = found[:: wanted.pulses_per_turn]
+    edges_s = edges_s[:: wanted.pulses_per_turn]
     end_s = max(group.start_s + group.rows / group.rate_hz for group in groups.values())
-    kept = found[(found >= zero_s) & (found < end_s)]
+    kept = edges_s[(edges_s >= zero_s) & (edges_s < end_s)]
     log.remarks.append(
         f"{len(kept)} keyphasor edges: {entry.name} {wanted.edge} through {level:.4g}, straight line between samples"
     )
@@ -402,12 +402,12 @@ def block_starts(rows: int, first: float, rate: float) -> list[int]:
         unit = int(rate) // math.gcd(int(rate), TICK_RATE_HZ)
         return list(range(0, rows, unit * max(1, round(_BLOCK_S * rate / unit))))
     length = max(1, round(_BLOCK_S * rate))
-    found = [0]
-    while found[-1] + length < rows:
-        near = np.arange(found[-1] + (length + 1) // 2, found[-1] + length + 1)
+    starts = [0]
+    while starts[-1] + length < rows:
+        near = np.arange(starts[-1] + (length + 1) // 2, starts[-1] + length + 1)
         ticks = first + near * (TICK_RATE_HZ / rate)
-        found.append(int(near[np.argmin(np.abs(ticks - np.rint(ticks)))]))
-    return found
+        starts.append(int(near[np.argmin(np.abs(ticks - np.rint(ticks)))]))
+    return starts
 
 
 def _edge_blocks(conversion: Conversion) -> Iterator[tuple[int, str, wire.Block]]:

@@ -118,7 +118,7 @@ def _group_signals(signals: Sequence[MappedSignal], mapping: Mapping) -> dict[st
     table, moved = default_table(), mapping.resample.method != "none"
     places, last = {name: number for number, name in enumerate((*table.groups, *table.channels))}, math.inf
     names = sorted(dict.fromkeys(entry.target.group for entry in signals), key=lambda name: places.get(name, last))
-    found: dict[str, list[MappedSignal]] = {}
+    groups: dict[str, list[MappedSignal]] = {}
     for name in names:
         parts: list[list[MappedSignal]] = []
         for entry in (entry for entry in signals if entry.target.group == name):
@@ -129,8 +129,8 @@ def _group_signals(signals: Sequence[MappedSignal], mapping: Mapping) -> dict[st
                 own.append(entry)
         parts.sort(key=lambda one: (-len(one), min(places.get(entry.name, len(places)) for entry in one)))
         free = (text for number in count(2) if (text := f"{name}_{number}") not in names)
-        found |= dict(zip((name, *islice(free, len(parts) - 1)), parts, strict=True))
-    return found
+        groups |= dict(zip((name, *islice(free, len(parts) - 1)), parts, strict=True))
+    return groups
 
 
 def _share_axis(a: clock.TimeAxis, b: clock.TimeAxis) -> bool:
@@ -269,8 +269,8 @@ def quantise(
             channels.append(channel)
             columns.append(column)
             imported.append(_make_imported_channel(entry, channel, rule, group.rate_hz))
-        known = default_table().groups.get(next(iter(group.channels.values())).target.group)
-        title = known.title if known is not None else name
+        default_group = default_table().groups.get(next(iter(group.channels.values())).target.group)
+        title = default_group.title if default_group is not None else name
         tables[name] = Group(name=name, title=title, rate_hz=channels[0].rate_hz, channels=tuple(channels))
         counts[name] = np.stack(columns, axis=1)
         present[name] = np.all([np.isfinite(entry.values) for entry in group.channels.values()], axis=0)
@@ -328,10 +328,10 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, n
     channel = check(Channel, channel.model_dump(), field=f"channels.{entry.name}")
     if keeps and raw is not None:
         return channel, raw.astype(np.int32), f"integers of the source, {abs(channel.scale):.6g} {channel.unit} each"
-    found = np.rint((np.nan_to_num(values) - channel.offset) / channel.scale)
-    if len(found) and not limits.min <= found.min() <= found.max() <= limits.max:
+    counts = np.rint((np.nan_to_num(values) - channel.offset) / channel.scale)
+    if len(counts) and not limits.min <= counts.min() <= counts.max() <= limits.max:
         raise InputError(f"channels.{entry.name}", "within the range of its counts", float(np.nanmax(np.abs(values))))
-    return channel, found.astype(np.int32), f"2^{round(math.log2(abs(scale)))} {channel.unit}"
+    return channel, counts.astype(np.int32), f"2^{round(math.log2(abs(scale)))} {channel.unit}"
 
 
 def _make_imported_channel(entry: MappedSignal, channel: Channel, rule: str, rate_hz: float) -> ImportedChannel:

@@ -95,11 +95,11 @@ class Log:
             for entry in source.entries
             if wanted.group in (None, entry.group)
         ]
-        found = [pair for pair in inside if pair[1].name == wanted.source]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in found)
+        matches = [pair for pair in inside if pair[1].name == wanted.source]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in matches)
             raise InputError(f"{where}.group", f"set, as {wanted.source} occurs in {places}", wanted.group or None)
         if not inside:
             groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)

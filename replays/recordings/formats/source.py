@@ -65,14 +65,14 @@ def formats() -> dict[str, Format]:
 
 @cache
 def _extensions() -> tuple[dict[str, Format], list[str]]:
-    found, broken = load_extensions("rig.formats", Format, FORMATS)
+    plugins, broken = load_extensions("rig.formats", Format, FORMATS)
     suffixes_in_use = {suffix for each in FORMATS.values() for suffix in each.suffixes}
-    for name, form in list(found.items()):
+    for name, form in list(plugins.items()):
         if renamed := suffixes_in_use.intersection(form.suffixes):
             broken.append(f"{name} ({', '.join(sorted(renamed))} is the ending of another format)")
-            del found[name]
+            del plugins[name]
         suffixes_in_use.update(form.suffixes)
-    return found, broken
+    return plugins, broken
 
 
 def load_format(form: Format) -> Any:
@@ -198,10 +198,10 @@ def open_source(path: Path, options: FileOptions) -> Source:
     suffix = path.suffix.lower()
     form = next((each for each in formats().values() if suffix in each.suffixes), None)
     if form is None:
-        known = ", ".join(suffix for each in formats().values() for suffix in each.suffixes)
+        suffixes = ", ".join(suffix for each in formats().values() for suffix in each.suffixes)
         broken = _extensions()[1]
         unusable = f"; not usable: {', '.join(broken)}" if broken else ""
-        raise InputError("file", f"a file that ends in {known}{unusable}", str(path))
+        raise InputError("file", f"a file that ends in {suffixes}{unusable}", str(path))
     try:
         with open_file(path) as file:
             empty = not file.read(1)
@@ -261,8 +261,8 @@ def _read_sidecar(path: Path) -> dict[str, str]:
             attached = read_json(file.read(DOCUMENT_BYTES + 1)).get("documents")
     except (OSError, InputError):  # missing, or written by another program
         return {}
-    found = attached if isinstance(attached, dict) else {}
-    kinds = {name: found.get(name.removesuffix(".json")) for name in DOCUMENTS}
+    documents = attached if isinstance(attached, dict) else {}
+    kinds = {name: documents.get(name.removesuffix(".json")) for name in DOCUMENTS}
     return {name: json.dumps(document) for name, document in kinds.items() if isinstance(document, dict)}
 
 
@@ -299,12 +299,12 @@ def _check(signal: FileSignal) -> None:
 def _make_distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
     """Return the entries with a number appended to names that repeat in a group."""
     counts: dict[tuple[str, str], int] = {}
-    found = []
+    distinct = []
     for entry in entries:
         key = (entry.group, entry.name)
         counts[key] = counts.get(key, 0) + 1
-        found.append(entry if counts[key] == 1 else replace(entry, name=f"{entry.name} #{counts[key]}"))
-    return tuple(found)
+        distinct.append(entry if counts[key] == 1 else replace(entry, name=f"{entry.name} #{counts[key]}"))
+    return tuple(distinct)
 
 
 def load_library(what: str, name: str, module: str | None = None) -> Any:

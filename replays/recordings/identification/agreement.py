@@ -52,15 +52,15 @@ def solve_weighted(
     weights = [1.0 if one else 0.0 for one in enabled or [True] * len(target)]
     grams = [has * (one.T @ one) for one, has in zip(columns, weights, strict=True)]
     sides = [has * (one.T @ z) for one, z, has in zip(columns, target, weights, strict=True)]
-    found = np.zeros(columns[0].shape[1])
+    solution = np.zeros(columns[0].shape[1])
     for _ in range(_MAX_REWEIGHTINGS):
         square = sum(gram / scale**2 for gram, scale in zip(grams, scales, strict=True))
         side = sum(one / scale**2 for one, scale in zip(sides, scales, strict=True))
         if priors is not None:
             square, side = square + np.diag(priors[1] ** -2.0), side + priors[0] * priors[1] ** -2.0
-        found = solve_normal(np.asarray(square), np.asarray(side))
-        scales = [max(1.0, rms(z - a @ found)) for z, a in zip(target, columns, strict=True)]
-    return found
+        solution = solve_normal(np.asarray(square), np.asarray(side))
+        scales = [max(1.0, rms(z - a @ solution)) for z, a in zip(target, columns, strict=True)]
+    return solution
 
 
 def signal_sizes(parts: Mapping[str, Measured]) -> list[float]:
@@ -101,21 +101,21 @@ class ChannelState:
 
 
 def approach(
-    predictor: Predictor, values: np.ndarray, known: np.ndarray, *, by_residuals: bool, enabled: Sequence[bool]
+    predictor: Predictor, values: np.ndarray, priors: np.ndarray, *, by_residuals: bool, enabled: Sequence[bool]
 ) -> tuple[np.ndarray, ChannelState]:
     """Search values near a start on which most channels agree.
 
     Args:
         predictor: Predictor of the channels.
         values: Start of the search, shape (keys,).
-        known: Means and standard deviations of the priors, shape (2, keys).
+        priors: Means and standard deviations of the priors, shape (2, keys).
         by_residuals: True: channels are weighted by their residuals from the first step on; False: by their signals.
         enabled: Channels that are used.
 
     Returns:
         The values, and the channels at them.
     """
-    means, deviations = known
+    means, deviations = priors
     low, high = means - MAX_PRIOR_DEVIATION * deviations, means + MAX_PRIOR_DEVIATION * deviations
     here = evaluate(predictor, values)
     assert here is not None
@@ -143,10 +143,10 @@ def approach(
 def evaluate(predictor: Predictor, values: np.ndarray) -> ChannelState | None:
     """Return the channels at given values; None if the model rejects the values."""
     try:
-        found = predictor.predict(values).values
+        predicted = predictor.predict(values).values
     except (InputError, SimulationError):
         return None
-    apart = {name: part.values - found[name] for name, part in predictor.parts.items()}
+    apart = {name: part.values - predicted[name] for name, part in predictor.parts.items()}
     return ChannelState([one / floor for one, floor in split_channels(predictor.parts, apart)], [])
 
 
@@ -183,7 +183,7 @@ def jackknife_half_widths(
     here: ChannelState,
     times_s: Sequence[np.ndarray],
     scales: Sequence[float],
-    known: tuple[np.ndarray, np.ndarray],
+    prior: tuple[np.ndarray, np.ndarray],
     first_s: float,
 ) -> np.ndarray:
     """Return half of 95 % intervals by a jackknife over channels and over blocks of time.
@@ -192,7 +192,7 @@ def jackknife_half_widths(
         here: Channels at the values.
         times_s: Sample times of each channel [s], shape (n,).
         scales: Inverse weight of each channel.
-        known: Prior terms of the normal equations, shapes (unknowns, unknowns) and (unknowns,).
+        prior: Prior terms of the normal equations, shapes (unknowns, unknowns) and (unknowns,).
         first_s: Time of the hammer pulse [s].
 
     Returns:
@@ -207,7 +207,7 @@ def jackknife_half_widths(
 
     def step(place: int, one: int) -> np.ndarray:
         kept = [piece for piece in pieces if piece[place] != one]
-        return solve_normal(known[0] + sum(piece[2] for piece in kept), known[1] + sum(piece[3] for piece in kept))
+        return solve_normal(prior[0] + sum(piece[2] for piece in kept), prior[1] + sum(piece[3] for piece in kept))
 
     return np.max(
         [jackknife(np.array([step(place, one) for one in {piece[place] for piece in pieces}])) for place in (0, 1)],

@@ -13,22 +13,22 @@ from rig.base.errors import check_new_file, whole_file
 from rig.physics.parameters import DEFAULT_SET, Parameter, load_parameters, set_names
 
 
-def format_set(found: Identification, *, recording: str) -> str:
+def format_set(result: Identification, *, recording: str) -> str:
     """Return the parameter set as TOML: the set of the experiment with the identified values replaced.
 
     Values that are not seen keep their start. Values that are only seen together are all written as fitted, with a
     note.
     """
-    scene = found.question.experiment.scene
+    scene = result.question.experiment.scene
     base = scene.parameters if scene.parameters in set_names() else DEFAULT_SET
-    span = f"{found.from_s:.4f} to {found.window.end_s:.4f} s"
+    span = f"{result.from_s:.4f} to {result.window.end_s:.4f} s"
     lines = [
-        f"# Made by `rig identify`; the model's verdict: {found.judgement.verdict}.",
+        f"# Made by `rig identify`; the model's verdict: {result.judgement.verdict}.",
         f"title = {_quoted(f'Fitted to {recording}, {span}')}",
         f"base = {_quoted(base)}",
     ]
     before = load_parameters(base).entries
-    fitted = {finding.unknown.key: finding for finding in found.judgement.findings}
+    fitted = {finding.unknown.key: finding for finding in result.judgement.findings}
     for key, entry in scene.load_parameters().entries.items():
         finding = fitted.get(key)
         if finding is None:
@@ -71,13 +71,13 @@ def write_set(text: str, path: Path) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
-def identification_document(found: Identification, *, recording: str) -> dict[str, Any]:
+def identification_document(result: Identification, *, recording: str) -> dict[str, Any]:
     """Return all results as a JSON document; non-finite numbers are null."""
-    judgement = found.judgement
+    judgement = result.judgement
     return {
         "recording": recording,
-        "window_s": [found.from_s, found.window.end_s],
-        "window_ends_because": found.why,
+        "window_s": [result.from_s, result.window.end_s],
+        "window_ends_because": result.why,
         "verdict": judgement.verdict,
         "fits": judgement.fits,
         "white": judgement.white,
@@ -108,10 +108,10 @@ def identification_document(found: Identification, *, recording: str) -> dict[st
                 "chi2": stage.chi2,
                 "chi2_of_new_samples": stage.fresh,
             }
-            for stage in found.stages
+            for stage in result.stages
         ],
-        "simulations": found.runs,
-        "spread_made_smaller": found.narrowed,
+        "simulations": result.runs,
+        "spread_made_smaller": result.narrowed,
     }
 
 

@@ -129,24 +129,24 @@ def identify(
     limit_s = float(question.observation.times_s[-1]) + 1e-6
     end_s = first_s  # of the last window that was accepted
     look_s, growth_s = _LOOK_AHEAD_S, math.inf
-    seen = search.find_horizon(min(limit_s, end_s + look_s))
-    while not seen.whole and seen.time_s < first_s + _MIN_GROWTH_S:
-        if not search.narrow(seen.by):
+    horizon = search.find_horizon(min(limit_s, end_s + look_s))
+    while not horizon.whole and horizon.time_s < first_s + _MIN_GROWTH_S:
+        if not search.narrow(horizon.by):
             must = "one whose first samples can be predicted (start it before the first contacts, or use better start "
-            must += f"values): the response to a change of {seen.by} by {_MIN_SPREAD:g} of its scale is not linear"
+            must += f"values): the response to a change of {horizon.by} by {_MIN_SPREAD:g} of its scale is not linear"
             raise InputError("window", must, [first_s, limit_s])
-        seen = search.find_horizon(min(limit_s, end_s + look_s))
+        horizon = search.find_horizon(min(limit_s, end_s + look_s))
     good: _State | None = None
     nonlinear_growths, shortened = 0, False
     for _ in range(_MAX_STAGES):
         # Linear as far as the look-ahead, or up to the first nonlinearity; less after a jump.
-        reached_s = min(limit_s, end_s + growth_s, max(seen.time_s, end_s + _MIN_GROWTH_S))
-        why = "the look-ahead ends there" if seen.whole else _NONLINEAR.format(seen.by)
+        reached_s = min(limit_s, end_s + growth_s, max(horizon.time_s, end_s + _MIN_GROWTH_S))
+        why = "the look-ahead ends there" if horizon.whole else _NONLINEAR.format(horizon.by)
         if progress is not None:
-            progress(f"fitting: window to {reached_s:.2f} s, {search.describe_known(precision)} values known")
+            progress(f"fitting: window to {reached_s:.2f} s, {search.describe_determined(precision)} values known")
         before = search.state
         stage = search.extend(reached_s, why)
-        look_s = 2.0 * look_s if seen.whole else _LOOK_AHEAD_S
+        look_s = 2.0 * look_s if horizon.whole else _LOOK_AHEAD_S
         after = search.find_horizon(min(limit_s, reached_s + look_s))
         straight = after.whole or after.time_s >= reached_s - 1e-9
         if search.jump > _MAX_JUMP and before.stages:
@@ -161,16 +161,16 @@ def identify(
             growth_s, shortened = after.time_s - end_s, True  # only once, and only as far as it stays linear
             continue
         last = before.stages[-1] if before.stages else None
-        if not whole and last is not None and not stage.explained and search.known(last, _SUFFICIENT_PRECISION):
+        if not whole and last is not None and not stage.explained and search.is_determined(last, _SUFFICIENT_PRECISION):
             good = before
             why = "after that, the model does not explain the samples within their noise: to "
             why += f"{reached_s:.4f} s, chi2 is {stage.fresh:.3g} a sample"
             break
-        end_s, seen, growth_s, shortened = reached_s, after, math.inf, False
+        end_s, horizon, growth_s, shortened = reached_s, after, math.inf, False
         # If the response is nonlinear within the window, the intervals are too narrow; more samples may correct that.
         nonlinear_growths = 0 if straight else nonlinear_growths + 1
         good = search.state if straight else good
-        if straight and not whole and search.known(stage, precision):
+        if straight and not whole and search.is_determined(stage, precision):
             why = f"every value is known within {precision:g} of its scale"
             break
         if end_s >= limit_s:
@@ -215,9 +215,9 @@ class _Search:
     def find_horizon(self, end_s: float) -> Horizon:
         """Return the time up to which the response to the remaining uncertainty is linear."""
         window = Window(self.question, end_s)
-        found = find_horizon(window, self.state.z, self.state.covariance)
+        horizon = find_horizon(window, self.state.z, self.state.covariance)
         self.runs += window.runs
-        return found
+        return horizon
 
     def narrow(self, key: str) -> bool:
         """Reduce the spread of one value; return False if it is already minimal."""
@@ -229,12 +229,12 @@ class _Search:
         self.state = replace(self.state, covariance=np.diag(self._loose**2))
         return True
 
-    def known(self, stage: Stage, part: float) -> bool:
+    def is_determined(self, stage: Stage, part: float) -> bool:
         """Return whether all requested values were known within a fraction of their scales after a stage."""
         requested = np.array([not unknown.nuisance for unknown in self.question.unknowns])
         return bool((stage.half_widths < part * self.scale)[requested].all())
 
-    def describe_known(self, part: float) -> str:
+    def describe_determined(self, part: float) -> str:
         """Return how many of the requested values are known within a fraction of their scales, as text."""
         requested = np.array([not unknown.nuisance for unknown in self.question.unknowns])
         stages = self.state.stages
@@ -249,7 +249,7 @@ class _Search:
         chi2 = self._fit(window)  # again, with slopes along the new principal directions
         squares = window.residuals(self.state.z) ** 2
         rows = before.window.rows if before.window is not None else 0
-        count = max(1, int(window.known[rows:].sum()))
+        count = max(1, int(window.valid[rows:].sum()))
         fresh, usual = float(squares[rows:].sum()) / count, before.stages[-1].chi2 if before.stages else 1.0
         explained = fresh < usual * (1.0 + _CHI2_SIGMAS * math.sqrt(2.0 / count))
         deviation = np.sqrt(np.diag(self.state.covariance))
@@ -264,7 +264,7 @@ class _Search:
         """Fit on a window with a weak prior, update the covariance, and return chi2 per degree of freedom."""
         self._solve(window, np.diag(0.5 / self._loose), np.zeros(len(self.state.z)))
         squares = float((window.residuals(self.state.z) ** 2).sum())
-        chi2 = squares / max(1, int(window.known.sum()) - len(self.state.z))
+        chi2 = squares / max(1, int(window.valid.sum()) - len(self.state.z))
         self._learn(window, chi2)
         return chi2
 
@@ -279,8 +279,8 @@ class _Search:
         self._solve(window, blind.T / reach, self.state.z, robust=robust)
         slopes, residuals = window.slopes(self.state.z, self.state.covariance), window.residuals(self.state.z)
         far = np.abs(residuals) > _OUTLIER
-        known = window.known & ~far if robust and far.sum() <= _MAX_OUTLIERS * window.known.sum() else window.known
-        judgement = judge(window, self.state.z, slopes * known[..., None], residuals * known, known)
+        valid = window.valid & ~far if robust and far.sum() <= _MAX_OUTLIERS * window.valid.sum() else window.valid
+        judgement = judge(window, self.state.z, slopes * valid[..., None], residuals * valid, valid)
         return Identification(
             question=self.question,
             judgement=judgement,
@@ -332,9 +332,9 @@ class _Search:
             raise InputError("start", "values that the model accepts", window.values(begin).tolist())
 
         def residuals(z: np.ndarray) -> np.ndarray:
-            found = window.residuals_or_none(z)
+            table = window.residuals_or_none(z)
             # Values that the model rejects have an infinite cost, so the search shortens its step.
-            shown = np.full(window.known.size, np.inf) if found is None else found.ravel()
+            shown = np.full(window.valid.size, np.inf) if table is None else table.ravel()
             return np.concatenate([shown, held @ z - aim])
 
         def jacobian(z: np.ndarray) -> np.ndarray:

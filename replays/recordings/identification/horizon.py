@@ -66,7 +66,7 @@ def find_horizon(window: Window, z: np.ndarray, covariance: np.ndarray) -> Horiz
             continue  # at a limit there is only one side
         slope, curvature = (up - down) / (2.0 * part), ((up + down) / 2.0 - base) / part**2
         slope, curvature = (
-            np.sqrt(np.add.reduceat((np.where(window.known, part, 0.0) ** 2).sum(axis=1), starts))
+            np.sqrt(np.add.reduceat((np.where(window.valid, part, 0.0) ** 2).sum(axis=1), starts))
             for part in (slope, curvature)
         )
         nonlinear = np.flatnonzero((curvature > MAX_NONLINEARITY * slope) & (curvature > MIN_NONLINEARITY))

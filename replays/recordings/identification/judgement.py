@@ -112,7 +112,7 @@ class Judgement:
         return f"lack of fit: the residuals are {math.sqrt(self.chi2):.3g} times the noise; no value is a result"
 
 
-def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarray, known: np.ndarray) -> Judgement:
+def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarray, valid: np.ndarray) -> Judgement:
     """Judge a fit.
 
     Args:
@@ -120,17 +120,17 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
         z: Fitted values in scales, shape (unknowns,).
         slopes: d predicted / d z over the noise, shape (rows, channels, unknowns).
         residuals: Measured minus predicted over the noise, shape (rows, channels).
-        known: Mask of the samples that count, shape (rows, channels); slopes and residuals are 0 for the others.
+        valid: Mask of the samples that count, shape (rows, channels); slopes and residuals are 0 for the others.
     """
     unknowns, observation, values = window.question.unknowns, window.question.observation, window.values(z)
     reach = np.array([unknown.reach / unknown.scale for unknown in unknowns])
-    count = int(known.sum())
+    count = int(valid.sum())
     _, singular, directions = np.linalg.svd(triangular_factor(slopes * reach))
     dof = max(1, count - len(unknowns))
     chi2 = float((residuals**2).sum()) / dof
     quantile = float(student(dof))
     unsure = _CHI2_TOLERANCE if "measured" in observation.noise_from else 0.0
-    spread = 1.0 + _ERROR_RATIO * _misfit(residuals, known, unsure) / quantile
+    spread = 1.0 + _ERROR_RATIO * _misfit(residuals, valid, unsure) / quantile
     observable = quantile * spread < singular  # the 95 % interval along the direction is within the reach
     blind = directions[~observable].T
     part = np.linalg.norm(blind, axis=1) if blind.size else np.zeros(len(unknowns))
@@ -141,11 +141,11 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     noise_only = np.sqrt(np.diag(plain))
     covariance = plain * spread**2
     channels = tuple(
-        _channel(name, residuals[:, column], known[:, column]) for column, name in enumerate(observation.names)
+        _channel(name, residuals[:, column], valid[:, column]) for column, name in enumerate(observation.names)
     )
     if not _is_explained(chi2, dof) or sum(not channel.white for channel in channels) > len(channels) // 10:
         covariance = _max_covariance(covariance, plain @ _scores(slopes * reach, residuals) @ plain)
-    stretch = _widenings(window, z, covariance * np.outer(reach, reach), residuals, known, far=quantile, spread=spread)
+    stretch = _widenings(window, z, covariance * np.outer(reach, reach), residuals, valid, far=quantile, spread=spread)
     covariance = _with_priors(covariance * np.outer(stretch, stretch), unknowns, reach)
     deviation, inflation = np.sqrt(np.diag(covariance)), 1.0
     clear = (part < _MIN_PART) & ~alone & (noise_only > 0.0)
@@ -173,7 +173,7 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     )
 
 
-def _misfit(residuals: np.ndarray, known: np.ndarray, unsure: float) -> float:
+def _misfit(residuals: np.ndarray, valid: np.ndarray, variance_error: float) -> float:
     """Return the size of the model error over the noise: root of the excess sum of squares from the worst row on.
 
     It is added to the intervals as the largest possible bias: bias-aware intervals, after Armstrong and Kolesár
@@ -181,11 +181,11 @@ def _misfit(residuals: np.ndarray, known: np.ndarray, unsure: float) -> float:
 
     Args:
         residuals: Residuals over the noise, shape (rows, channels).
-        known: Mask of the samples that count, shape (rows, channels).
-        unsure: Relative uncertainty of the noise variance.
+        valid: Mask of the samples that count, shape (rows, channels).
+        variance_error: Relative uncertainty of the noise variance.
     """
-    squares, counts = (part.sum(axis=1)[::-1].cumsum() for part in (residuals**2, known))
-    beyond = squares - (1.0 + unsure) * counts - _ERROR_SIGMAS * np.sqrt(2.0 * counts)
+    squares, counts = (part.sum(axis=1)[::-1].cumsum() for part in (residuals**2, valid))
+    beyond = squares - (1.0 + variance_error) * counts - _ERROR_SIGMAS * np.sqrt(2.0 * counts)
     return math.sqrt(max(0.0, float(beyond[counts >= min(_MIN_ROWS, counts[-1])].max())))
 
 
@@ -260,8 +260,8 @@ def widen_interval(finding: Finding, by: float) -> Finding:
 
 
 def _describe_unseen(unknown: Unknown) -> str:
-    known = "the prior" if unknown.prior is not None else "the bounds" if unknown.bounded else "the value itself"
-    return f"not seen in this window: its interval would be wider than {known}"
+    limit = "the prior" if unknown.prior is not None else "the bounds" if unknown.bounded else "the value itself"
+    return f"not seen in this window: its interval would be wider than {limit}"
 
 
 def _describe_inseparable(place: int, unknowns: tuple[Unknown, ...], blind: np.ndarray) -> str:
@@ -299,8 +299,8 @@ def _with_similar(finding: Finding, place: int, findings: list[Finding], correla
 
 def _with_priors(covariance: np.ndarray, unknowns: tuple[Unknown, ...], reach: np.ndarray) -> np.ndarray:
     """Return the covariance of z / reach with the priors added."""
-    given = [place for place, unknown in enumerate(unknowns) if unknown.prior is not None]
-    for place in given:
+    places = [place for place, unknown in enumerate(unknowns) if unknown.prior is not None]
+    for place in places:
         prior = unknowns[place].prior
         assert prior is not None
         column = covariance[:, place].copy()
@@ -314,7 +314,7 @@ def _widenings(
     z: np.ndarray,
     covariance: np.ndarray,
     residuals: np.ndarray,
-    known: np.ndarray,
+    valid: np.ndarray,
     *,
     far: float,
     spread: float,
@@ -333,8 +333,8 @@ def _widenings(
         wanted = 0.5 * (far * spread) ** 2
         for sign in (-1.0, 1.0):
             for factor in _WIDENINGS:
-                found = window.residuals_or_none(z + sign * factor * far * along)
-                if found is None or float((found[known] ** 2).sum()) - base > wanted:
+                moved = window.residuals_or_none(z + sign * factor * far * along)
+                if moved is None or float((moved[valid] ** 2).sum()) - base > wanted:
                     break
                 stretch[place] = max(stretch[place], _WIDENINGS[min(_WIDENINGS.index(factor) + 1, len(_WIDENINGS) - 1)])
     return stretch
@@ -360,8 +360,8 @@ def _max_covariance(covariance: np.ndarray, other: np.ndarray) -> np.ndarray:
     return covariance * np.outer(np.maximum(stretch, 1.0), np.maximum(stretch, 1.0))
 
 
-def _channel(name: str, residuals: np.ndarray, known: np.ndarray) -> ChannelFit:
-    held = residuals[known]
+def _channel(name: str, residuals: np.ndarray, valid: np.ndarray) -> ChannelFit:
+    held = residuals[valid]
     if len(held) < 2 * _LAGS or not held.any():
         return ChannelFit(name, float(np.sqrt(np.mean(held**2))) if len(held) else 0.0, 0.0, white=True)
     centred = held - held.mean()

@@ -60,11 +60,11 @@ def identify_log(
     # Report errors of the request before the long search.
     first = ask(recording, experiment, keys, start=start, bounds=bounds, priors=priors, channels=channels)
     tuned = tune(
-        recording, first.experiment, (*keys, *(key for key in NUISANCES if key not in keys)), known=priors or {},
+        recording, first.experiment, (*keys, *(key for key in NUISANCES if key not in keys)), priors=priors or {},
         channels=channels, to_s=to_s, progress=progress,
     )  # fmt: skip
     nuisances = find_nuisances(tuned.baseline, NUISANCES, excluded=keys)
-    all_priors = {key: known for key, known in nuisances.items() if known is not None} | dict(priors or {})
+    all_priors = {key: prior for key, prior in nuisances.items() if prior is not None} | dict(priors or {})
     question = ask(
         recording, tuned.baseline, (*keys, *nuisances), start=tuned.values, bounds=bounds, priors=all_priors,
         nuisances=nuisances, channels=channels, window=(window_start_s(tuned.baseline), tuned.end_s),
@@ -77,7 +77,7 @@ def identify_log(
     question = replace(question, observation=replace(observation, noise=observation.noise * louder))
     window = _window(question)
     progress(f"fitted: {len(question.keys)} values, to {tuned.end_s:.4f} s; their intervals")
-    slopes, residuals, known = window.slopes_by_keys(z), window.residuals(z), window.known
+    slopes, residuals, valid = window.slopes_by_keys(z), window.residuals(z), window.valid
     scale = np.array([unknown.scale for unknown in question.unknowns])
     places = [list(tuned.values).index(key) for key in question.keys]
     moves = 1.96 * np.sqrt(np.mean(tuned.moves[:, places] ** 2, axis=0)) / scale
@@ -96,7 +96,7 @@ def identify_log(
     for one in shown:
         change = solve_normal(square + flat.T @ flat, flat.T @ np.nan_to_num(one - residuals).ravel())
         moved = np.hypot(moved, np.abs(change))
-    judgement = judge(window, z, slopes, residuals, known)
+    judgement = judge(window, z, slopes, residuals, valid)
     why = "the model, or the search, does not explain later samples"
     if tuned.end_s < tuned.longest_s and any(one.standing == "not seen" for one in judgement.findings[: len(keys)]):
         why += "; later samples may show the missing values, with another --start or contact law"
@@ -115,9 +115,9 @@ def _window(question: Question, parts: dict[str, Measured] | None = None) -> Win
 
 def _priors(question: Question) -> tuple[np.ndarray, np.ndarray]:
     """Return the prior terms of the normal equations in scales, shapes (unknowns, unknowns) and (unknowns,)."""
-    known = [(one, *(one.prior or (one.start, one.scale))) for one in question.unknowns]
-    square = np.diag([(one.scale / sigma) ** 2 for one, _, sigma in known])
-    return square, np.array([(mean - one.start) * one.scale / sigma**2 for one, mean, sigma in known])
+    priors = [(one, *(one.prior or (one.start, one.scale))) for one in question.unknowns]
+    square = np.diag([(one.scale / sigma) ** 2 for one, _, sigma in priors])
+    return square, np.array([(mean - one.start) * one.scale / sigma**2 for one, mean, sigma in priors])
 
 
 def _widen_intervals(judgement: Judgement, moved: np.ndarray) -> Judgement:

@@ -92,13 +92,13 @@ class Fitted:
     start: float
     value: float
     half_width: float
-    known: tuple[float, float] | None = None
+    prior: tuple[float, float] | None = None
     """Mean and standard deviation of the prior."""
 
     @property
     def beyond(self) -> bool:
         """True if the value is at the limit that its prior allows."""
-        return _is_beyond(self.value, self.known)
+        return _is_beyond(self.value, self.prior)
 
     @property
     def line(self) -> str:
@@ -114,8 +114,8 @@ class Fitted:
         return f"{self.key}: {self.value:.6g} ±{self.half_width:.2g}, fitted ({change:+.2g} from the log)"
 
 
-def _is_beyond(value: float, known: tuple[float, float] | None) -> bool:
-    return known is not None and abs(value - known[0]) > 0.99 * MAX_PRIOR_DEVIATION * known[1]
+def _is_beyond(value: float, prior: tuple[float, float] | None) -> bool:
+    return prior is not None and abs(value - prior[0]) > 0.99 * MAX_PRIOR_DEVIATION * prior[1]
 
 
 @dataclass(frozen=True)
@@ -153,8 +153,8 @@ class Tuned:
 
     def is_better_than(self, other: Tuned) -> bool:
         """Return whether this fit explains a longer window, or an equal one with smaller residuals."""
-        left, its = (sum(math.log(scale) for scale in one.scales.values()) for one in (self, other))
-        return (self.end_s, -left) > (other.end_s, -its)
+        own, its = (sum(math.log(scale) for scale in one.scales.values()) for one in (self, other))
+        return (self.end_s, -own) > (other.end_s, -its)
 
     def with_changes(self, changes: dict[str, Any]) -> Tuned:
         """Return the same values with another model."""
@@ -190,7 +190,7 @@ def find_nuisances(
     """
     if experiment.begin is None:  # the scene started with the recording: the pulse is shifted, not the clock
         keys = [_PULSE if key == "clock.offset_s" else key for key in keys]
-    found: dict[str, tuple[float, float] | None] = {}
+    priors: dict[str, tuple[float, float] | None] = {}
     for key in keys:
         if key in excluded:
             continue
@@ -199,8 +199,8 @@ def find_nuisances(
         except InputError:
             continue  # no hammer pulse
         deviation = experiment.unsure.get(key) or _DEVIATIONS.get(key) or _RELATIVE.get(key, 0.0) * abs(value)
-        found[key] = (value, deviation) if deviation else None
-    return found
+        priors[key] = (value, deviation) if deviation else None
+    return priors
 
 
 def fit_initial_state(recording: Recording, experiment: Experiment) -> Experiment:
@@ -219,8 +219,8 @@ def fit_initial_state(recording: Recording, experiment: Experiment) -> Experimen
     predictor = Predictor(experiment, keys, parts)
 
     def shown(values: Sequence[float] | np.ndarray) -> list[np.ndarray]:
-        found = predictor.predict(np.asarray(values)).values
-        return [one for one, _ in split_channels(parts, found)]
+        solution = predictor.predict(np.asarray(values)).values
+        return [one for one, _ in split_channels(parts, solution)]
 
     still = np.zeros(len(keys))
     still[: len(keys) - 1] = predictor.start[:-1]
@@ -233,10 +233,10 @@ def fit_initial_state(recording: Recording, experiment: Experiment) -> Experimen
         # The zero of a probe is unknown, so the mean of each channel is removed.
         target.append(subtract_mean(measured - middle[c]) / floor)
         columns.append(subtract_mean(np.column_stack(slopes)) / floor)
-    found = solve_weighted(target, columns, signal_sizes(parts))
-    moves = np.array([*found[2:], 0.0]) * predictor.scales
+    solution = solve_weighted(target, columns, signal_sizes(parts))
+    moves = np.array([*solution[2:], 0.0]) * predictor.scales
     values = dict(zip(keys, (still + moves).tolist(), strict=True))
-    return with_values(experiment, values | {ANGLE: math.atan2(found[1], found[0])})
+    return with_values(experiment, values | {ANGLE: math.atan2(solution[1], solution[0])})
 
 
 def _with_edge_speed(recording: Recording, experiment: Experiment) -> Experiment:
@@ -261,11 +261,11 @@ def _with_edge_speed(recording: Recording, experiment: Experiment) -> Experiment
 
 def _compute_power(parts: Mapping[str, Measured], speed_hz: float) -> float:
     """Return the power of the channels at a speed over their noise, without mean and drift."""
-    found = 0.0
+    power = 0.0
     for part in parts.values():
         turning = np.exp(2j * math.pi * speed_hz * part.times_s) * np.hanning(len(part.times_s))
-        found += float(np.sum(np.abs(turning @ (subtract_mean(part.values) / part.floor)) ** 2)) / len(part.times_s)
-    return found
+        power += float(np.sum(np.abs(turning @ (subtract_mean(part.values) / part.floor)) ** 2)) / len(part.times_s)
+    return power
 
 
 def find_free_nuisances(experiment: Experiment, keys: Sequence[str]) -> dict[str, tuple[float, float] | None]:
@@ -282,7 +282,7 @@ def tune(
     experiment: Experiment,
     keys: Sequence[str] = NUISANCES,
     *,
-    known: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, tuple[float, float]] | None = None,
     channels: Sequence[str] | None = None,
     to_s: float | None = None,
     late_s: Mapping[str, float] | None = None,
@@ -297,7 +297,7 @@ def tune(
         recording: The log.
         experiment: Experiment, as far as it is known.
         keys: Keys to fit.
-        known: Additional priors: means and standard deviations.
+        priors: Additional priors: means and standard deviations.
         channels: Channels to use; None for all.
         to_s: End of the used samples [s].
         late_s: Assumed delay of some channels [s].
@@ -308,7 +308,7 @@ def tune(
     """
     progress("speed, angle and position of the shaft before the hammer pulse")
     baseline = fit_initial_state(recording, experiment) if ANGLE in keys else experiment
-    wanted = find_nuisances(baseline, keys) | dict(known or {})
+    wanted = find_nuisances(baseline, keys) | dict(priors or {})
     first_s = _pulse_time_s(baseline)
     if first_s <= window_start_s(baseline):
         must = (
@@ -319,17 +319,17 @@ def tune(
     whole = observe(recording, baseline, channels=channels, window=(window_start_s(baseline), end_s)).parts
     whole = {name: part.remove_delays(late_s or {}) for name, part in whole.items()}
     whole = {name: _decimate(part, first_s - _FULL_RATE_S) for name, part in whole.items()}
-    found = _fit_best(baseline, wanted, whole, progress)
-    if max(found.scales) > _FAULTY_RMS and (early := _with_earlier_pulse(baseline, whole)) is not None:
+    fit = _fit_best(baseline, wanted, whole, progress)
+    if max(fit.scales) > _FAULTY_RMS and (early := _with_earlier_pulse(baseline, whole)) is not None:
         other = _fit_windows(early, wanted, whole, progress, by_residuals=True, without=("hammer",))
-        if other.rank() > found.rank():
-            baseline, found = early, other
-    far = [key for key, value in zip(wanted, found.values, strict=True) if _is_beyond(float(value), wanted[key])]
+        if other.rank() > fit.rank():
+            baseline, fit = early, other
+    far = [key for key, value in zip(wanted, fit.values, strict=True) if _is_beyond(float(value), wanted[key])]
     if far:
         widened = wanted | {key: (one[0], _PRIOR_WIDENING * one[1]) for key in far if (one := wanted[key]) is not None}
-        found = max(found, _fit_best(baseline, widened, whole, progress), key=_WindowFit.rank)
-    half = np.hypot(1.96 * np.sqrt(np.diag(found.covariance) + np.mean(found.moves**2, axis=0)), found.jackknife)
-    fitted = dict(zip(wanted, found.values.tolist(), strict=True))
+        fit = max(fit, _fit_best(baseline, widened, whole, progress), key=_WindowFit.rank)
+    half = np.hypot(1.96 * np.sqrt(np.diag(fit.covariance) + np.mean(fit.moves**2, axis=0)), fit.jackknife)
+    fitted = dict(zip(wanted, fit.values.tolist(), strict=True))
     # A prior keeps its width, around the prior mean.
     prior_widths = [1.96 * math.hypot(one[1], fitted[key] - one[0]) if one else math.inf for key, one in wanted.items()]
     return Tuned(
@@ -340,12 +340,12 @@ def tune(
             for (key, value), width in zip(fitted.items(), np.minimum(half, prior_widths).tolist(), strict=True)
         ),
         values=fitted,
-        covariance=found.covariance,
-        moves=found.moves,
+        covariance=fit.covariance,
+        moves=fit.moves,
         about_s=min(float(part.times_s[0]) for part in whole.values()),
-        end_s=found.end_s,
+        end_s=fit.end_s,
         longest_s=end_s,
-        scales=dict(zip((name for part in whole.values() for name in part.names), found.scales, strict=True)),
+        scales=dict(zip((name for part in whole.values() for name in part.names), fit.scales, strict=True)),
     )
 
 
@@ -398,13 +398,13 @@ def _fit_best(
     progress: Callable[[str], None],
 ) -> _WindowFit:
     """Return the best of several fits; if channels disagree, also fit by the majority, with and without the hammer."""
-    found = _fit_windows(baseline, wanted, whole, progress, by_residuals=False)
+    best = _fit_windows(baseline, wanted, whole, progress, by_residuals=False)
     for without in ((), ("hammer",)):
-        early = without and found.end_s <= _pulse_time_s(baseline) + _WINDOWS_S[0]  # its own time
-        if early or (max(found.scales) > _FAULTY_RMS and (found.median_scale > _FAULTY_RMS or not without)):
+        early = without and best.end_s <= _pulse_time_s(baseline) + _WINDOWS_S[0]  # its own time
+        if early or (max(best.scales) > _FAULTY_RMS and (best.median_scale > _FAULTY_RMS or not without)):
             other = _fit_windows(baseline, wanted, whole, progress, by_residuals=True, without=without)
-            found = max(found, other, key=_WindowFit.rank)
-    return found
+            best = max(best, other, key=_WindowFit.rank)
+    return best
 
 
 def _with_earlier_pulse(baseline: Experiment, whole: dict[str, Measured]) -> Experiment | None:
@@ -416,12 +416,12 @@ def _with_earlier_pulse(baseline: Experiment, whole: dict[str, Measured]) -> Exp
     parts = {name: part.select_until(high_s).select_from(low_s) for name, part in whole.items()}
     predictor, at_s = Predictor(baseline, (_PULSE,), parts), get_value(baseline, _PULSE)
 
-    def left(late_s: float) -> float:
+    def misfit(late_s: float) -> float:
         here = evaluate(predictor, np.array([at_s + late_s]))
         return math.inf if here is None else sum(math.log(max(1.0, rms(z))) for z in here.apart)
 
-    late_s = min(np.linspace(-_SEARCH_S, _SEARCH_S, 41).tolist(), key=left)
-    return with_values(baseline, {_PULSE: at_s + late_s}) if left(late_s) < left(0.0) else None
+    late_s = min(np.linspace(-_SEARCH_S, _SEARCH_S, 41).tolist(), key=misfit)
+    return with_values(baseline, {_PULSE: at_s + late_s}) if misfit(late_s) < misfit(0.0) else None
 
 
 def _fit_windows(
@@ -453,31 +453,31 @@ def _fit_windows(
         predictor = Predictor(baseline, tuple(wanted), parts)
         # Without a prior, a value is held so weakly that only one without any effect keeps its start.
         loose = zip(predictor.start, predictor.scales, strict=True)
-        known = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
+        priors = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
 
         def fitted(start: np.ndarray) -> tuple[np.ndarray, ChannelState, list[float]]:
-            found, here = approach(predictor, start, known, by_residuals=by_residuals, enabled=every)  # noqa: B023
+            fit, here = approach(predictor, start, priors, by_residuals=by_residuals, enabled=every)  # noqa: B023
             enabled = [has and rms(z) <= _FAULTY_RMS for z, has in zip(here.apart, every, strict=True)]
             if len(enabled) / 2.0 < sum(enabled) < len(enabled):
                 # Faulty channels are left out: even a small weight would move values that no other channel shows.
-                found, here = approach(predictor, found, known, by_residuals=True, enabled=enabled)  # noqa: B023
-            return found, here, [max(1.0, rms(z)) for z in here.apart]
+                fit, here = approach(predictor, fit, priors, by_residuals=True, enabled=enabled)  # noqa: B023
+            return fit, here, [max(1.0, rms(z)) for z in here.apart]
 
-        found, here, now = fitted(values)
+        fit, here, now = fitted(values)
         unseen = [
             place for place, key in enumerate(wanted)
-            if key not in NUISANCES and covariance[place, place] > 0.25 * known[1, place] ** 2
+            if key not in NUISANCES and covariance[place, place] > 0.25 * priors[1, place] ** 2
         ]  # fmt: skip
         if scales and unseen and _is_worse(now, scales):
-            found, here, now = fitted(search_restarts(predictor, values, unseen, every))
+            fit, here, now = fitted(search_restarts(predictor, values, unseen, every))
         if _is_worse(now, scales):
             break  # the model does not explain the longer window, which is for the judgement to report
         scales = now
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
-        moves.append(found - values)
-        covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
+        moves.append(fit - values)
+        covariance, values = np.linalg.inv(square + np.diag(priors[1] ** -2.0)), fit
         times = [part.times_s for part in parts.values() for _ in part.names]
-        before = np.diag(known[1] ** -2.0), np.zeros(len(values))
+        before = np.diag(priors[1] ** -2.0), np.zeros(len(values))
         end_s, jackknife = first_s + length, jackknife_half_widths(here, times, scales, before, first_s)
     return _WindowFit(values, covariance, np.array(moves[-_COUNTED_GROWTHS:]), end_s, scales, jackknife)
 

@@ -110,11 +110,11 @@ class Observation:
 
     def tabulate(self, values: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
         """Return values by group as one table, nan without a sample, shape (rows, channels)."""
-        found = np.full((rows, len(self.names)), np.nan)
+        table = np.full((rows, len(self.names)), np.nan)
         for name, held in values.items():
             columns = np.array([self.names.index(channel) for channel in self.parts[name].names])
-            found[self.rows[name][: len(held), None], columns] = held
-        return found
+            table[self.rows[name][: len(held), None], columns] = held
+        return table
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,8 @@ def ask(
     """
     if not keys or len(set(keys)) < len(keys):
         raise InputError("fit", "different keys, at least one", ", ".join(keys))
-    for option, given in (("start", start), ("bounds", bounds), ("prior", priors)):
-        for key in given or {}:
+    for option, entries in (("start", start), ("bounds", bounds), ("prior", priors)):
+        for key in entries or {}:
             if key not in keys:
                 raise InputError(option, f"of a key that is fitted ({', '.join(keys)})", key)
     for key in keys:

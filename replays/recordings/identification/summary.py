@@ -55,32 +55,32 @@ def cells(finding: Finding) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def window_line(found: Identification) -> str:
+def window_line(result: Identification) -> str:
     """Return which samples were used, and why the window ends."""
-    names = found.question.observation.names
-    grown = f", grown in {len(found.stages)} stages" if found.stages else ""
+    names = result.question.observation.names
+    grown = f", grown in {len(result.stages)} stages" if result.stages else ""
     return (
-        f"window {found.from_s:.4f} to {found.window.end_s:.4f} s, {found.window.rows} rows of {len(names)} channels"
-        f"{_decimation(found)}{grown}; end of the window: {found.why}"
+        f"window {result.from_s:.4f} to {result.window.end_s:.4f} s, {result.window.rows} rows of {len(names)} channels"
+        f"{_decimation(result)}{grown}; end of the window: {result.why}"
     )
 
 
-def spread_line(found: Identification) -> str:
+def spread_line(result: Identification) -> str:
     """Return the initial spread of values for which the default was too wide; empty without such values."""
-    if not found.narrowed:
+    if not result.narrowed:
         return ""
-    text = ", ".join(f"{key} {part:.2g}" for key, part in found.narrowed.items())
+    text = ", ".join(f"{key} {part:.2g}" for key, part in result.narrowed.items())
     return f"initial spread reduced, as the model is not linear over more (relative to each value's scale): {text}"
 
 
-def _decimation(found: Identification) -> str:
-    every = found.question.observation.every
+def _decimation(result: Identification) -> str:
+    every = result.question.observation.every
     return f" (decimated: one sample in {every})" if every > 1 else ""
 
 
-def fit_line(found: Identification) -> str:
+def fit_line(result: Identification) -> str:
     """Return the goodness of the fit."""
-    judgement = found.judgement
+    judgement = result.judgement
     line = f"chi2 {judgement.chi2:.4g} per degree of freedom ({judgement.dof}); {judgement.verdict}"
     if judgement.fits and judgement.inflation > 1.1:
         line += f"; intervals up to {judgement.inflation:.2g} times as wide as from noise alone"
@@ -89,15 +89,15 @@ def fit_line(found: Identification) -> str:
     return line
 
 
-def make_report(found: Identification, *, recording: str, origin: Mapping[str, str] | None = None) -> Report:
+def make_report(result: Identification, *, recording: str, origin: Mapping[str, str] | None = None) -> Report:
     """Return the report of a fit.
 
     Args:
-        found: The fit.
+        result: The fit.
         recording: Name of the recording.
         origin: Software that made the report, by name.
     """
-    question, judgement = found.question, found.judgement
+    question, judgement = result.question, result.judgement
     results = "; ".join(
         " ".join((finding.unknown.key, *cells(finding)[2:5])).rstrip()
         if finding.standing == "identified"
@@ -107,15 +107,15 @@ def make_report(found: Identification, *, recording: str, origin: Mapping[str, s
     good = judgement.fits and all(finding.standing == "identified" for finding in judgement.findings)
     report = Report(
         f"Identification from {recording}",
-        f"{results}. {fit_line(found)}.",
+        f"{results}. {fit_line(result)}.",
         origin=origin,
         mark="good" if good else "open",
     )
-    report.picture(growth(found), "95 % intervals over the end of the window, relative to each value's scale; right, "
+    report.picture(growth(result), "95 % intervals over the end of the window, relative to each value's scale; right, "
                    "the correlation of the values.")  # fmt: skip
-    report.text(f"W{window_line(found)[1:]}.")
-    if found.narrowed:
-        report.text(f"The {spread_line(found)}.")
+    report.text(f"W{window_line(result)[1:]}.")
+    if result.narrowed:
+        report.text(f"The {spread_line(result)}.")
     report.heading("Values")
     rows = [Row(cells(finding), _MARKS[finding.standing]) for finding in judgement.findings]
     report.table(HEADINGS, rows, caption="95 % intervals of single values, from the slopes at the optimum.")
@@ -148,7 +148,7 @@ def make_report(found: Identification, *, recording: str, origin: Mapping[str, s
             for channel, source in zip(judgement.channels, question.observation.noise_from, strict=True)
         ],
     )  # fmt: skip
-    report.picture(overlay(found), "Recorded samples (dots) and the fitted model (line); right, their difference "
+    report.picture(overlay(result), "Recorded samples (dots) and the fitted model (line); right, their difference "
                    "in units of the sensor's noise, from shortly before the first impact.")  # fmt: skip
     report.heading("Growth of the window")
     report.table(
@@ -159,7 +159,7 @@ def make_report(found: Identification, *, recording: str, origin: Mapping[str, s
                 *(f"{value:.6g} ±{half:.1g}" for value, half in zip(stage.values, stage.half_widths, strict=True)),
                 stage.why,
             )
-            for stage in found.stages
+            for stage in result.stages
         ],
         caption="These fits have a weak prior around the start: an interval as wide as the prior has no information.",
     )  # fmt: skip
@@ -167,11 +167,11 @@ def make_report(found: Identification, *, recording: str, origin: Mapping[str, s
 
 
 @house_style()
-def overlay(found: Identification) -> Figure:
+def overlay(result: Identification) -> Figure:
     """Draw samples, fit and residuals of the channels."""
-    observation, window = found.question.observation, found.window
-    predicted = window.predicted(found.z) * observation.noise
-    residuals = window.residuals(found.z)
+    observation, window = result.question.observation, result.window
+    predicted = window.predicted(result.z) * observation.noise
+    residuals = window.residuals(result.z)
     moved = np.argsort(-np.ptp(predicted / observation.noise, axis=0), kind="stable")[:_MAX_PANELS]
     shown = sorted(int(place) for place in moved)
     figure = new_figure(1.35 * len(shown) + 0.8)
@@ -199,24 +199,24 @@ def _shown_from_s(times_s: np.ndarray, predicted: np.ndarray) -> float:
 
 
 @house_style()
-def growth(found: Identification) -> Figure:
+def growth(result: Identification) -> Figure:
     """Draw the intervals over the end of the window, and the correlation of the values."""
-    keys = found.question.keys
+    keys = result.question.keys
     figure = new_figure(4.6)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    ends = [stage.end_s for stage in found.stages]
+    ends = [stage.end_s for stage in result.stages]
     left.set_prop_cycle(color=[BLUE, RED, GREEN, PINK, ORANGE, SKY, BLACK], marker=list("osD^vhP"))
-    for place, unknown in enumerate(found.question.unknowns):
-        left.semilogy(ends, [stage.half_widths[place] / unknown.scale for stage in found.stages], label=unknown.key)
+    for place, unknown in enumerate(result.question.unknowns):
+        left.semilogy(ends, [stage.half_widths[place] / unknown.scale for stage in result.stages], label=unknown.key)
     left.set(title="Interval widths", xlabel="end of the window [s]", ylabel="half of the 95 % interval / scale [1]")
-    image = right.imshow(found.judgement.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+    image = right.imshow(result.judgement.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
     # Names once, at the side: below the picture long ones would run off it.
     right.set_xticks(range(len(keys)), [str(place + 1) for place in range(len(keys))])
     right.set_yticks(range(len(keys)), [f"{key}  {place + 1}" for place, key in enumerate(keys)])
     right.grid(visible=False)
     right.set_title("Correlation")
-    for row, place in np.argwhere(np.isfinite(found.judgement.correlation)) if len(keys) <= _MAX_LABELLED else ():
-        value = found.judgement.correlation[row, place]
+    for row, place in np.argwhere(np.isfinite(result.judgement.correlation)) if len(keys) <= _MAX_LABELLED else ():
+        value = result.judgement.correlation[row, place]
         right.text(place, row, f"{value:+.2f}", ha="center", va="center", color="white" if abs(value) > 0.6 else BLACK)
     figure.colorbar(image, ax=right, label="correlation [1]", shrink=0.8)
     add_legend(figure, left)

@@ -33,7 +33,7 @@ class Window:
         self._start = np.array([unknown.start for unknown in question.unknowns])
         self._scale = np.array([unknown.scale for unknown in question.unknowns])
         self._measured = observation.values[: self.rows] / observation.noise
-        self.known = np.isfinite(self._measured)
+        self.valid = np.isfinite(self._measured)
 
     @property
     def runs(self) -> int:
@@ -52,12 +52,12 @@ class Window:
             SimulationError: The state became non-finite.
         """
         observation = self.question.observation
-        found = self._predictor.predict(self.values(z))
-        return observation.tabulate(found.values, self.rows) / observation.noise
+        prediction = self._predictor.predict(self.values(z))
+        return observation.tabulate(prediction.values, self.rows) / observation.noise
 
     def residuals(self, z: np.ndarray) -> np.ndarray:
         """Return measured minus predicted over the noise, 0 for lost samples, shape (rows, channels)."""
-        return np.where(self.known, self._measured - self.predicted(z), 0.0)
+        return np.where(self.valid, self._measured - self.predicted(z), 0.0)
 
     def residuals_or_none(self, z: np.ndarray) -> np.ndarray | None:
         """Return the residuals; None if the model rejects the values."""
@@ -85,14 +85,14 @@ class Window:
             width = float((above - below) @ direction)
             if width == 0.0:
                 raise InputError("start", "values with room for a change", self.values(z).tolist())
-            whitened.append(np.where(self.known, (up - down) / width, 0.0))
+            whitened.append(np.where(self.valid, (up - down) / width, 0.0))
         return np.einsum("nck,pk->ncp", np.stack(whitened, axis=-1), directions)
 
     def slopes_by_keys(self, z: np.ndarray) -> np.ndarray:
         """Return the slopes by each value alone, in the predictor's own steps, shape (rows, channels, unknowns)."""
         observation = self.question.observation
-        found = self._predictor.derivatives(self.values(z)).slopes
-        columns = [observation.tabulate(one, self.rows) * s for one, s in zip(found, self._scale, strict=True)]
+        slopes = self._predictor.derivatives(self.values(z)).slopes
+        columns = [observation.tabulate(one, self.rows) * s for one, s in zip(slopes, self._scale, strict=True)]
         return np.nan_to_num(np.stack(columns, axis=-1) / observation.noise[:, None])
 
     def _side(self, z: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -157,7 +157,7 @@ def read_measured(recording: Recording, scene: Scene, *, longest_s: float = math
     Raises:
         InputError: No channel that the model knows has two samples.
     """
-    found, formulas, sensors = {}, scene.formulas(), scene.sensors
+    parts, formulas, sensors = {}, scene.formulas(), scene.sensors
     ideal = sensors.chain == "ideal"
     noise = sensors.noise and not ideal
     for name, group in recording.table.groups.items():
@@ -172,7 +172,7 @@ def read_measured(recording: Recording, scene: Scene, *, longest_s: float = math
         step = np.array([channel.lsb_v for channel in channels])
         random = noise_levels > _MIN_NOISE_STEPS * step
         floor = np.where(random, np.hypot(noise_levels, step / np.sqrt(12.0)), np.maximum(noise_levels, step))
-        found[name] = Measured(
+        parts[name] = Measured(
             group=name,
             channels=channels,
             times_s=samples.times_s[order],
@@ -183,9 +183,9 @@ def read_measured(recording: Recording, scene: Scene, *, longest_s: float = math
             ideal=ideal,
             version=recording.table.version,
         )
-    if not found:
+    if not parts:
         raise InputError("file", "a recording with two samples of a channel that the model knows", str(recording.path))
-    return found
+    return parts
 
 
 @dataclass(frozen=True)
@@ -236,11 +236,11 @@ class _Channels:
 
     def values(self) -> dict[str, np.ndarray]:
         self.take(self._last)  # for the sample on the last row
-        found = {}
+        values_by_group = {}
         for part in self._parts:
             values = self._groups[part.group].engineering(np.concatenate(self._counts[part.group]))
-            found[part.group] = interpolate_rows(values, part.times_s * self._rate_hz - self._first)
-        return found
+            values_by_group[part.group] = interpolate_rows(values, part.times_s * self._rate_hz - self._first)
+        return values_by_group
 
 
 def interpolate_rows(values: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -262,10 +262,10 @@ def interpolate_rows(values: np.ndarray, places: np.ndarray) -> np.ndarray:
     taps = np.arange(min(6, len(values)))
     first = np.clip(np.floor(places).astype(int) - (len(taps) - 1) // 2, 0, len(values) - len(taps))
     weights = lagrange(np.clip(places, 0.0, len(values) - 1.0) - first, taps)
-    found = np.zeros((len(places), values.shape[1]))
+    rows = np.zeros((len(places), values.shape[1]))
     for tap, weight in zip(taps, weights, strict=True):
-        found += weight[:, None] * values.take(first + tap, axis=0)
-    return found
+        rows += weight[:, None] * values.take(first + tap, axis=0)
+    return rows
 
 
 def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> list[_Channels]:

@@ -144,9 +144,9 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
             request["duration_ms"] = ticks * _TICK_S * 1e3
         at_s = fields.get("at_s", command.at_s)
         kept.append(TimedCommand(at_s=at_s, request=check_command(command.request.command, request)))
-    left = tuple(entry for place, entry in enumerate(sent, start=len(timed)) if place not in own)
+    rest = tuple(entry for place, entry in enumerate(sent, start=len(timed)) if place not in own)
     data = scene.model_dump() | {"commands": [entry.model_dump() for entry in kept]}
-    return replace(changed, scene=parse_scene(data), commands=left)
+    return replace(changed, scene=parse_scene(data), commands=rest)
 
 
 def _get_begin(experiment: Experiment, key: str) -> MotionStart:
@@ -231,7 +231,7 @@ class Predictor:
         """
         values = np.asarray(values, dtype=float)
         base = self.predict(values)
-        found: list[dict[str, np.ndarray]] = []
+        slopes: list[dict[str, np.ndarray]] = []
         smooth = np.zeros(len(self.keys), dtype=bool)
         directions = [self._direction(values, place) for place in range(len(self.keys))]
         for place, (key, direction) in enumerate(zip(self.keys, directions, strict=True)):
@@ -241,12 +241,12 @@ class Predictor:
                 slope, smooth[place] = self._quotient(values, place, step * direction, base)
                 if smooth[place]:
                     break
-            found.append(slope)
-        for place, (slope, direction) in enumerate(zip(found, directions, strict=True)):
+            slopes.append(slope)
+        for place, (slope, direction) in enumerate(zip(slopes, directions, strict=True)):
             for other in np.flatnonzero(direction):  # subtract the slopes of the values that were changed along
                 if other != place:
-                    slope |= {name: one - direction[other] * found[other][name] for name, one in slope.items()}
-        return Derivatives(base, tuple(found), smooth)
+                    slope |= {name: one - direction[other] * slopes[other][name] for name, one in slope.items()}
+        return Derivatives(base, tuple(slopes), smooth)
 
     def _direction(self, values: np.ndarray, place: int) -> np.ndarray:
         """Return the change of all values in the difference quotient of one, shape (keys,).
@@ -274,7 +274,7 @@ class Predictor:
         ends = [round((below + node) * _TICK_S, 9) for node in (0, 1)]
         first, second = (self.predict((*values[:place], end, *values[place + 1 :])) for end in ends)
         part = values[place] / _TICK_S - below
-        both = {name: (1.0 - part) * found + part * second.values[name] for name, found in first.values.items()}
+        both = {name: (1.0 - part) * array + part * second.values[name] for name, array in first.values.items()}
         return replace(first, values=both)
 
     def _quotient(
@@ -348,9 +348,9 @@ def _place(experiment: Experiment, key: str) -> int:
     places.sort(key=lambda place: commands[place].at_s)
     if int(number) > len(places):
         raise InputError(key, f"a command of the experiment, which has {len(places)} of {kind}", int(number))
-    known = ["at_s", *(name for name in type(commands[places[int(number) - 1]].request).model_fields)]
-    if field not in known or field == "command":
-        raise InputError(key, f"a field of {kind}: {', '.join(name for name in known if name != 'command')}", field)
+    fields = ["at_s", *(name for name in type(commands[places[int(number) - 1]].request).model_fields)]
+    if field not in fields or field == "command":
+        raise InputError(key, f"a field of {kind}: {', '.join(name for name in fields if name != 'command')}", field)
     return places[int(number) - 1]
 
 

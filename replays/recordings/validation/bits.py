@@ -81,7 +81,7 @@ class Bits:
             there = made.groups[name].names
             if group.names != there and set(group.names) <= set(there):
                 follower.picked = [there.index(channel) for channel in group.names]
-                follower.found.columns = (len(group.names), len(there))
+                follower.counts.columns = (len(group.names), len(there))
 
     def follow(self, frame: Frame) -> None:
         """Compare the next frame."""
@@ -131,7 +131,7 @@ def missing_rows(recording: Recording) -> dict[str, tuple[int, int]]:
     if not filled:
         return {}
     first_s, last_s = min(one.first_time_s for one in filled), max(one.last_time_s for one in filled)
-    found: dict[str, tuple[int, int]] = {}
+    losses: dict[str, tuple[int, int]] = {}
     for key, rate in groups.items():
         due = math.floor(last_s * rate + 1e-6) + 1 - math.ceil(first_s * rate - 1e-6)
         spans = sorted((block.index, block.index + len(block.values)) for block in recording.blocks(key))
@@ -142,8 +142,8 @@ def missing_rows(recording: Recording) -> dict[str, tuple[int, int]]:
         inside = spans[-1][1] - spans[0][0] - there if spans else 0
         outside = due - there - inside
         if lost := inside + (outside if outside > _EDGE_S * rate else 0):
-            found[key] = lost, due
-    return found
+            losses[key] = lost, due
+    return losses
 
 
 @dataclass
@@ -152,7 +152,7 @@ class _Follower:
     recorded: Iterator[Block]
     picked: list[int] | None = None
     """Recorded columns of the re-simulation, in their order; None for all."""
-    found: StreamBits = field(default_factory=StreamBits)
+    counts: StreamBits = field(default_factory=StreamBits)
     differences: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     """Numbers of differing rows, and their differences, up to a limit."""
     _waiting: Block | None = None
@@ -183,16 +183,16 @@ class _Follower:
         return self._waiting
 
     def _compare(self, recorded: Block, values: np.ndarray, like: Block) -> None:
-        found, n = self.found, len(recorded.values)
+        counts, n = self.counts, len(recorded.values)
         if self._next is not None:
-            found.skipped += max(0, recorded.index - self._next)
+            counts.skipped += max(0, recorded.index - self._next)
         self._next = recorded.index + n
         if recorded.index < self._first and len(values) and self._first > recorded.index:
-            found.beyond += n  # an older block again: its rows have been released
+            counts.beyond += n  # an older block again: its rows have been released
             return
         if n == 0:
             return
-        found.rows += n
+        counts.rows += n
         if self.key == EDGES:
             tick, values = recorded.tick, values - recorded.tick
         else:
@@ -202,24 +202,24 @@ class _Follower:
         )
         if encode_block(again) == encode_block(recorded):
             return
-        found.different += 1
+        counts.different += 1
         if values.shape != recorded.values.shape:
             row, column = 0, 0
         else:
             off = np.abs(values.astype(float) - recorded.values)
-            found.largest = max(found.largest, float(off.max()))
+            counts.largest = max(counts.largest, float(off.max()))
             rows = np.flatnonzero(off.any(axis=1))
             if sum(len(n) for n, _ in self.differences) < _MAX_DIFFERENT:
                 self.differences.append((recorded.index + rows, (recorded.values.astype(float) - values)[rows]))
             row, column = (int(k) for k in np.argwhere(values != recorded.values)[0]) if off.any() else (0, 0)
-        if found.first_s is None:
+        if counts.first_s is None:
             rate = recorded.rate_hz
             offset = recorded.values[row, 0] if self.key == EDGES else row * TICK_RATE_HZ / rate if rate else 0.0
-            found.first_s, found.first_column = float(recorded.tick + offset) / TICK_RATE_HZ, column
+            counts.first_s, counts.first_column = float(recorded.tick + offset) / TICK_RATE_HZ, column
 
     def finish(self) -> StreamBits:
         """Count the rows without a counterpart."""
         while (waiting := self._upcoming()) is not None:
-            self.found.beyond += len(waiting.values)
+            self.counts.beyond += len(waiting.values)
             self._waiting = None
-        return self.found
+        return self.counts

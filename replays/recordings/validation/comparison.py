@@ -213,21 +213,21 @@ def _resimulate(
     quick = simplify(experiment)
     step("perturbed, to find the predictable part")
     moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
-    found = bits.finish()
-    truth = [one.equal for key, one in found.items() if key.startswith(TRUTH)]
+    streams = bits.finish()
+    truth = [one.equal for key, one in streams.items() if key.startswith(TRUTH)]
     same = all(truth) and (bool(truth) or experiment.scene.generator is not None)
     names = [channel.name for part in parts.values() for channel in part.channels]
     off = {name for part in parts for name in bits.channels_off(part)}
     own: list[Explanation] = []
     if (
-        not all(one.equal for one in found.values())
+        not all(one.equal for one in streams.values())
         and all(truth)
         and len(off) < (len(names) if same else FEW_CHANNELS * len(names))
     ):
         own = own_faults(
             parts, nominal, bits.differences, recording.edges(), bits.edges_s(), partial(predict, experiment), step
         )  # fmt: skip
-    return _Resimulation(quick, criteria, parts, nominal, (moved,), found, None, own=tuple(own), same_motion=same)
+    return _Resimulation(quick, criteria, parts, nominal, (moved,), streams, None, own=tuple(own), same_motion=same)
 
 
 def _resimulate_log(

@@ -201,10 +201,10 @@ class Criteria(_Section):
         return next(fits, None)
 
 
-def _known_names(patterns: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
+def _known_names(patterns: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
     for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in known):
-            raise ValueError(f"patterns that match one of {', '.join(known)}")
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise ValueError(f"patterns that match one of {', '.join(names)}")
     return patterns
 
 

@@ -133,8 +133,8 @@ class Validation:
     @property
     def judged(self) -> int:
         """Number of applied criteria."""
-        asked = sum(one.good is not None for one in (*self.residuals, *self.statistics)) + len(self.truth)
-        return asked + (self.due_s is not None)
+        count = sum(one.good is not None for one in (*self.residuals, *self.statistics)) + len(self.truth)
+        return count + (self.due_s is not None)
 
     @property
     def beyond(self) -> list[str]:
@@ -144,24 +144,24 @@ class Validation:
     @property
     def failures(self) -> list[Failure]:
         """Criteria that are not met."""
-        found = []
+        rows = []
         for one in self.residuals:
             if one.good is False and one.broken is not None:
                 measure, value, limit = one.broken
                 criterion = f"{one.channel}, residual over noise: {measure}"
-                found.append(Failure(criterion, f"{value:.3g}", one.alone(measure), f"≤ {limit:.3g}"))
+                rows.append(Failure(criterion, f"{value:.3g}", one.alone(measure), f"≤ {limit:.3g}"))
         if self.due_s is not None:
             reached = f"{self.window_s[1]:.4f}"
-            found.append(Failure("trajectory, to the first contact [s]", reached, f"{self.due_s:.4f}", "beyond it"))
+            rows.append(Failure("trajectory, to the first contact [s]", reached, f"{self.due_s:.4f}", "beyond it"))
         for one in self.truth:
             if not one.good:
                 criterion = f"truth {one.table}.{one.column}, relative error"
-                found.append(Failure(criterion, f"{one.relative:.2g}", "0", f"≤ {one.limit:.2g}"))
+                rows.append(Failure(criterion, f"{one.relative:.2g}", "0", f"≤ {one.limit:.2g}"))
         for one in self.statistics:
             if one.good is False and one.limit is not None:
                 limit = f"± {one.limit:.2g}"
-                found.append(Failure(f"{one.phase}, {one.title}", f"{one.recorded:.5g}", f"{one.foretold:.5g}", limit))
-        return found
+                rows.append(Failure(f"{one.phase}, {one.title}", f"{one.recorded:.5g}", f"{one.foretold:.5g}", limit))
+        return rows
 
     @property
     def title(self) -> str:
@@ -231,9 +231,9 @@ class Validation:
         """Return everything except for the samples as a JSON document."""
         json_name = str if self.bits else earlier_name
         explained = None
-        if (found := self.explained) is not None:
-            ranked = [{**asdict(one), "name": json_name(one.name), "defects": one.defects} for one in found.ranked]
-            explained = {**asdict(found), "ranked": ranked, "best": [json_name(name) for name in found.best]}
+        if (cause := self.explained) is not None:
+            ranked = [{**asdict(one), "name": json_name(one.name), "defects": one.defects} for one in cause.ranked]
+            explained = {**asdict(cause), "ranked": ranked, "best": [json_name(name) for name in cause.best]}
         return _plain(
             {
                 "file": str(self.path),

@@ -195,13 +195,13 @@ def select_view(
 
 def quantities(view: View, phase: str) -> dict[str, float]:
     """Return the quantities of a view, except for spectra."""
-    found = {}
+    values = {}
     for name, quantity in QUANTITIES.items():
         if phase in quantity.phases and quantity.needs and name not in SPECTRA and view.has(*quantity.needs):
             if quantity.needs == _RING and not math.isfinite(view.touches) and name in ("contact_fraction", "impacts"):
                 continue
-            found[name] = quantity.read(view)
-    return found
+            values[name] = quantity.read(view)
+    return values
 
 
 def spectra(a: View, b: View, floors: dict[str, float]) -> dict[str, float]:
@@ -212,7 +212,7 @@ def spectra(a: View, b: View, floors: dict[str, float]) -> dict[str, float]:
         b: The other.
         floors: Noise of each signal x + j y, by the name of its spectrum.
     """
-    found = {}
+    distances = {}
     for name, channels in SPECTRA.items():
         if a.has(*channels) and b.has(*channels) and len(a.values[channels[0]]) >= 64:
             pair = [
@@ -221,8 +221,8 @@ def spectra(a: View, b: View, floors: dict[str, float]) -> dict[str, float]:
             ]
             # For a constant signal only the spectra of the noise would be compared.
             if all(signal.std() > _SIGNAL_FLOORS * floors[name] for signal in pair):
-                found[name] = spectrum_distance(*pair)
-    return found
+                distances[name] = spectrum_distance(*pair)
+    return distances
 
 
 def find_phases(view: View, *, floor_n: float) -> list[Phase]:

@@ -27,32 +27,32 @@ _MARKS: dict[bool | None, Mark] = {True: "good", False: "bad", None: "plain"}
 _WORDS = {True: "pass", False: "fail", None: "no limit"}
 
 
-def make_report(found: Validation, *, origin: Mapping[str, str] | None = None) -> Report:
+def make_report(validation: Validation, *, origin: Mapping[str, str] | None = None) -> Report:
     """Return a validation as a report.
 
     Args:
-        found: The validation.
+        validation: The validation.
         origin: Facts about the origin of the report, by name.
     """
     report = Report(
-        f"Validation of {found.title}",
-        f"{_sentence(found.verdict_line)}.",
+        f"Validation of {validation.title}",
+        f"{_sentence(validation.verdict_line)}.",
         origin=origin,
-        mark=OUTCOME_MARKS[found.outcome],
+        mark=OUTCOME_MARKS[validation.outcome],
     )
-    if found.parts and found.nominal is not None:
+    if validation.parts and validation.nominal is not None:
         report.picture(
-            _overview(found),
+            _overview(validation),
             "Difference of recorded and predicted signals over the noise of each channel: 1 is noise alone.",
         )
-    _conclusion(report, found)
-    _bits(report, found)
-    _trajectory(report, found)
-    _phases(report, found)
-    if found.calibration:
+    _conclusion(report, validation)
+    _bits(report, validation)
+    _trajectory(report, validation)
+    _phases(report, validation)
+    if validation.calibration:
         report.heading("Calibration")
         report.text("The recording's own calibration is used throughout. Differences from the rig's channel table:")
-        report.table(("channel", "differs in"), [tuple(line.partition(": ")[::2]) for line in found.calibration])
+        report.table(("channel", "differs in"), [tuple(line.partition(": ")[::2]) for line in validation.calibration])
     return report
 
 
@@ -60,18 +60,18 @@ def _sentence(text: str) -> str:
     return text[0].upper() + text[1:]
 
 
-def _conclusion(report: Report, found: Validation) -> None:
+def _conclusion(report: Report, validation: Validation) -> None:
     """Add the conclusion: first the explanation of the difference, then every criterion that fails."""
-    one = found.explained
+    one = validation.explained
     if one is not None:
         report.text(f"The first difference is at {one.from_s:.4f} s. {_sentence(one.conclusion)}.")
-    report.text(f"{_sentence(found.bits_line)}.")
-    report.table(("item", "value"), _about(found))
-    if found.failures and not found.good:
+    report.text(f"{_sentence(validation.bits_line)}.")
+    report.table(("item", "value"), _about(validation))
+    if validation.failures and not validation.good:
         report.heading("Failed criteria")
         report.table(
             ("criterion", "recorded", "predicted", "limit", "verdict"),
-            [Row((f.criterion, f.recorded, f.foretold, f.limit, "fail"), "bad") for f in found.failures],
+            [Row((f.criterion, f.recorded, f.foretold, f.limit, "fail"), "bad") for f in validation.failures],
             caption="For a residual, the first measure beyond its limit; ± is the largest difference.",
         )
     if one is None or not one.ranked:
@@ -90,8 +90,8 @@ def _conclusion(report: Report, found: Validation) -> None:
     )  # fmt: skip
 
 
-def _bits(report: Report, found: Validation) -> None:
-    if not found.bits:
+def _bits(report: Report, validation: Validation) -> None:
+    if not validation.bits:
         return
     report.heading("Bits")
     report.table(
@@ -101,88 +101,88 @@ def _bits(report: Report, found: Validation) -> None:
             Row((key, b.picked or "all", str(b.rows), str(b.different),
                  "" if b.first_s is None else f"{b.first_s:.6f}", f"{b.largest:.3g}",
                  str(b.skipped), "equal" if b.equal else "differs"), "good" if b.equal else "open")
-            for key, b in found.bits.items()
+            for key, b in validation.bits.items()
         ],
         caption="Largest difference in counts of the converter, or SI for truth.",
     )  # fmt: skip
 
 
-def _trajectory(report: Report, found: Validation) -> None:
+def _trajectory(report: Report, validation: Validation) -> None:
     report.heading("Trajectory")
-    begin, end = found.window_s
-    report.text(f"Compared sample by sample from {begin:.4f} to {end:.4f} s: {found.window_reason}.")
+    begin, end = validation.window_s
+    report.text(f"Compared sample by sample from {begin:.4f} to {end:.4f} s: {validation.window_reason}.")
     report.table(
         ("channel", "noise", "RMS", "limit", "largest", "drift", "reason of the limit", "verdict"),
         [
             Row((r.channel, f"{r.floor:.3g} {r.unit}".rstrip(), f"{r.rms:.3f}",
                  "" if math.isinf(r.limit) else f"{r.limit:.3f}", f"{r.peak:.2f}", f"{r.drift:.2f}", r.reason,
                  _WORDS[r.good]), _MARKS[r.good])
-            for r in found.residuals
+            for r in validation.residuals
         ],
         caption="Residual over the noise of the recording's own channel table; drift: largest mean of 128 samples, in "
         "standard errors.",
     )  # fmt: skip
-    if found.truth:
+    if validation.truth:
         report.table(
             ("truth", "column with the largest error", "error", "limit", "verdict"),
             [
                 Row((t.table, t.column, f"{t.relative:.2e}", f"{t.limit:.2e}", _WORDS[t.good]), _MARKS[t.good])
-                for t in found.truth
+                for t in validation.truth
             ],
         )
-    zooms = _zooms(found)
+    zooms = _zooms(validation)
     windows = "".join(f" and from {begin:.3f} to {end:.3f} s ({why})" for why, begin, end in zooms)
-    for part in found.parts.values():
+    for part in validation.parts.values():
         caption = f"{part.group}: recorded and predicted, in whole{windows}, and the residual over its noise."
-        report.picture(_group(found, part, zooms), caption)
+        report.picture(_group(validation, part, zooms), caption)
 
 
-def _phases(report: Report, found: Validation) -> None:
+def _phases(report: Report, validation: Validation) -> None:
     report.heading("Phases")
     report.table(
         ("phase", "quantity", "recorded", "predicted", "spread", "limit", "verdict"),
         [
             Row((s.phase, s.title, f"{s.recorded:.6g}", f"{s.foretold:.6g}", f"{s.spread:.2g}",
                  "" if s.limit is None else f"± {s.limit:.2g}", _WORDS[s.good]), _MARKS[s.good])
-            for s in found.statistics
+            for s in validation.statistics
         ],
         caption="Predicted is the median, spread the standard deviation over perturbed re-simulations with noise; "
         f"phases are read off the recording ({', '.join(PHASES)}).",
     )  # fmt: skip
-    names = {name for part in found.parts.values() for name in part.names}
+    names = {name for part in validation.parts.values() for name in part.names}
     pairs = [pair for pair in (("ring_x", "ring_y"), ("disk_x", "disk_y")) if names.issuperset(pair)]
     if pairs:
         report.picture(
-            _orbits(found, pairs), "Orbits and full spectra (two-sided, of x + j y), over the whole recording."
+            _orbits(validation, pairs), "Orbits and full spectra (two-sided, of x + j y), over the whole recording."
         )
 
 
-def _about(found: Validation) -> list[Row]:
+def _about(validation: Validation) -> list[Row]:
     rows = [
-        Row(("scene", found.scene)),
-        Row(("criteria", found.criteria)),
-        Row(("phases", "; ".join(f"{p.name} {p.from_s:.3f} to {p.to_s:.3f} s" for p in found.phases))),
-        Row(("rows lost", str(found.skipped))),
+        Row(("scene", validation.scene)),
+        Row(("criteria", validation.criteria)),
+        Row(("phases", "; ".join(f"{p.name} {p.from_s:.3f} to {p.to_s:.3f} s" for p in validation.phases))),
+        Row(("rows lost", str(validation.skipped))),
     ]
-    rows += [Row(("changed", f"{key} = {value}")) for key, value in found.changes.items()]
-    rows += [Row(("fitted first", one.line)) for one in found.fitted]
-    if found.calibration:
-        rows.append(Row(("calibration", found.calibration_line.removesuffix("; the report says how"))))
+    rows += [Row(("changed", f"{key} = {value}")) for key, value in validation.changes.items()]
+    rows += [Row(("fitted first", one.line)) for one in validation.fitted]
+    if validation.calibration:
+        rows.append(Row(("calibration", validation.calibration_line.removesuffix("; the report says how"))))
     return rows
 
 
-def _foretold(found: Validation, part: Measured) -> np.ndarray:
-    assert found.nominal is not None
-    return found.nominal.values[part.group]
+def _foretold(validation: Validation, part: Measured) -> np.ndarray:
+    assert validation.nominal is not None
+    return validation.nominal.values[part.group]
 
 
-def _zooms(found: Validation) -> list[tuple[str, float, float]]:
+def _zooms(validation: Validation) -> list[tuple[str, float, float]]:
     """Return the windows of detail plots: reason, begin and end [s]; overlapping ones are merged."""
-    last_s = max(float(part.times_s[-1]) for part in found.parts.values())
+    last_s = max(float(part.times_s[-1]) for part in validation.parts.values())
     starts = []
-    if found.explained is not None:
-        starts.append(("the first difference", found.explained.from_s))
-    contacts = [phase.from_s for phase in found.phases if phase.name not in ("free run", "decay")]
+    if validation.explained is not None:
+        starts.append(("the first difference", validation.explained.from_s))
+    contacts = [phase.from_s for phase in validation.phases if phase.name not in ("free run", "decay")]
     if contacts:
         starts.append(("the first contact", contacts[0]))
     starts.sort(key=lambda start: start[1])
@@ -197,19 +197,19 @@ def _zooms(found: Validation) -> list[tuple[str, float, float]]:
 
 
 @house_style()
-def _overview(found: Validation) -> Figure:
+def _overview(validation: Validation) -> Figure:
     """Draw the residual over noise of every channel over the whole time."""
     from matplotlib.colors import LogNorm
 
-    names = [channel.name for part in found.parts.values() for channel in part.channels]
+    names = [channel.name for part in validation.parts.values() for channel in part.channels]
     figure = new_figure(0.24 * len(names) + 1.2)
     axes = figure.subplots()
-    begin = min(float(part.times_s[0]) for part in found.parts.values())
-    end = max(float(part.times_s[-1]) for part in found.parts.values())
+    begin = min(float(part.times_s[0]) for part in validation.parts.values())
+    end = max(float(part.times_s[-1]) for part in validation.parts.values())
     edges, row = np.linspace(begin, end, _STRETCHES + 1), 0
     image: Any = None
-    for part in found.parts.values():
-        squares = ((part.values - _foretold(found, part)) / part.floor) ** 2
+    for part in validation.parts.values():
+        squares = ((part.values - _foretold(validation, part)) / part.floor) ** 2
         place = np.clip(np.digitize(part.times_s, edges) - 1, 0, _STRETCHES - 1)
         rows = np.bincount(place, minlength=_STRETCHES)
         for c in range(len(part.channels)):
@@ -218,7 +218,7 @@ def _overview(found: Validation) -> Figure:
             image = axes.pcolormesh(edges, [row - 0.5, row + 0.5], np.maximum(rms, 0.1)[None], cmap="cividis_r",
                                     norm=LogNorm(1.0, 1e3), rasterized=True)  # fmt: skip
             row += 1
-    for window_s in found.window_s:
+    for window_s in validation.window_s:
         axes.axvline(window_s, color="black", lw=1.2, ls=":")
     axes.set_yticks(range(len(names)), names)
     axes.set(xlabel="time [s]   (dotted: begin and end of the sample by sample comparison)", ylim=(row - 0.5, -0.5))
@@ -227,14 +227,14 @@ def _overview(found: Validation) -> Figure:
 
 
 @house_style()
-def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, float]]) -> Figure:
+def _group(validation: Validation, part: Measured, zooms: list[tuple[str, float, float]]) -> Figure:
     """Draw recorded and predicted signals of a group in whole, and with residuals in each detail window."""
     whole = ("the whole", float(part.times_s[0]), float(part.times_s[-1]))
     n, looks = len(part.channels), len(zooms or [whole])
     figure = new_figure((1.25 * n + 0.9) * looks + 0.3)
     # Each detail window has its own rows, so that a panel is wide enough to read.
     panels = figure.subplots(n * looks, 3, squeeze=False, sharex=False)
-    values = _foretold(found, part)
+    values = _foretold(validation, part)
     for look, window in enumerate(zooms or [whole]):
         for c, channel in enumerate(part.channels):
             left, middle, right = row = panels[look * n + c]
@@ -243,9 +243,9 @@ def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, floa
             _residual(right, part, values, c, window)
             left.set_ylabel(axis_label(channel.name, channel.unit))
             for axes, (why, begin, end) in zip(row, (whole, window, window), strict=True):
-                if begin < found.window_s[1] < end - 1e-6:
+                if begin < validation.window_s[1] < end - 1e-6:
                     axes.axvline(
-                        found.window_s[1], color="0.4", lw=1.0, ls=":", label="end of the comparison by sample"
+                        validation.window_s[1], color="0.4", lw=1.0, ls=":", label="end of the comparison by sample"
                     )
                 if end > begin:
                     axes.set_xlim(begin, end)
@@ -277,14 +277,14 @@ def _residual(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tu
 
 
 @house_style()
-def _orbits(found: Validation, pairs: list[tuple[str, str]]) -> Figure:
+def _orbits(validation: Validation, pairs: list[tuple[str, str]]) -> Figure:
     figure = new_figure(4.2 * len(pairs) + 0.4)
     panels = figure.subplots(len(pairs), 2, squeeze=False)
     for (left, right), pair in zip(panels, pairs, strict=True):
-        part = next(part for part in found.parts.values() if pair[0] in part.names)
+        part = next(part for part in validation.parts.values() if pair[0] in part.names)
         columns = [part.names.index(name) for name in pair]
         signals = [
-            values[:, columns[0]] + 1j * values[:, columns[1]] for values in (part.values, _foretold(found, part))
+            values[:, columns[0]] + 1j * values[:, columns[1]] for values in (part.values, _foretold(validation, part))
         ]
         rate = 1.0 / float(np.median(np.diff(part.times_s)))
         for signal, colour, label, style in zip(

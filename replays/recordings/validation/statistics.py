@@ -107,14 +107,14 @@ def statistics(
     shown = _ensemble(experiment, parts, criteria, members)
     results = []
     for number, phase in enumerate(phases):
-        seen, there = look(recorded, phase), look(nominal.values, phase)
+        measured, there = look(recorded, phase), look(nominal.values, phase)
         others = [look(loud, phase) for loud, _ in shown]
         samples: dict[str, tuple[float, list[float]]] = {}  # recorded value, and that of each member
         read = [quantities(other, phase.name) for other in others]
-        for name, value in quantities(seen, phase.name).items():
+        for name, value in quantities(measured, phase.name).items():
             samples[name] = value, [one[name] for one in read]
         distances = [spectra(other, there, floors) for other in others]
-        for name, value in spectra(seen, there, floors).items():
+        for name, value in spectra(measured, there, floors).items():
             samples[name] = value, [one.get(name, 1.0) for one in distances]
         for name, columns in _ENERGIES.items() if "energy" in tables else ():
             ends = [energy_change(tables["energy"], columns, phase, prediction) for _, prediction in shown]
@@ -146,15 +146,15 @@ def _viewer(experiment: Experiment, parts: dict[str, Measured]) -> Callable[[dic
 
 
 def _ensemble(
-    experiment: Experiment, parts: dict[str, Measured], criteria: Criteria, given: Sequence[Prediction]
+    experiment: Experiment, parts: dict[str, Measured], criteria: Criteria, predictions: Sequence[Prediction]
 ) -> list[tuple[dict[str, np.ndarray], Prediction]]:
     """Return perturbed runs: signals with independent noise, and the predictions without."""
     generator = np.random.default_rng(0)  # the same noise and perturbations in every validation
     members = []
     for number in range(criteria.ensemble.members):
         part = criteria.ensemble.perturbation * generator.uniform(-1.0, 1.0)
-        moved = None if given else perturbed(experiment, criteria.window.parameters, part)
-        prediction = given[number] if moved is None else predict(moved, parts)
+        moved = None if predictions else perturbed(experiment, criteria.window.parameters, part)
+        prediction = predictions[number] if moved is None else predict(moved, parts)
         loud = {
             name: values + parts[name].floor * parts[name].random * generator.standard_normal(values.shape)
             for name, values in prediction.values.items()

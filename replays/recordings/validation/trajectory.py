@@ -114,7 +114,7 @@ def residuals(
         criteria: The limits.
         end_s: End of the window [s].
     """
-    found = []
+    judged = []
     for name, part in parts.items():
         n = part.count_rows(end_s)
         if n == 0:
@@ -122,8 +122,8 @@ def residuals(
         z = scaled(part, nominal.values[name][:n], [other.values[name][:n] for other in others])
         for c, channel in enumerate(part.channels):
             criterion = criteria.find_trajectory(channel.name)
-            found.append(_judge(part, c, z[:, c], criterion))
-    return found
+            judged.append(_judge(part, c, z[:, c], criterion))
+    return judged
 
 
 def _judge(part: Measured, c: int, z: np.ndarray, criterion: TrajectoryCriterion | None) -> ChannelResidual:

@@ -36,15 +36,15 @@ class TruthResult:
 
 def recorded_truth(recording: Recording, *, longest_s: float) -> TruthTables:
     """Return row numbers and values of the truth tables with the columns of this version."""
-    found = {}
+    tables = {}
     for name, columns in TRUTH.items():
         if name not in recording.catalogue.get("truth", {}):
             continue
         samples = recording.truth(name)
         if samples.names == columns and len(samples.index):
             kept = samples.times_s < longest_s
-            found[name] = (samples.index[kept], samples.values[kept])
-    return found
+            tables[name] = (samples.index[kept], samples.values[kept])
+    return tables
 
 
 def judge_truth(
@@ -56,7 +56,7 @@ def judge_truth(
     end_s: float,
 ) -> list[TruthResult]:
     """Compare truth tables with the prediction up to a time [s]; limits include ten times a perturbation's effect."""
-    found = []
+    results = []
     for name, (index, values) in tables.items():
         here, there = nominal.truth[name], perturbed.truth[name]
         kept = (index < min(len(here), len(there))) & (index < end_s * nominal.truth_rate_hz)
@@ -70,8 +70,8 @@ def judge_truth(
         off = np.abs(recorded - here[rows]).max(axis=0) / scale
         allowed = criteria.truth.relative + 10.0 * np.abs(there[rows] - here[rows]).max(axis=0) / scale
         worst = int(np.argmax(off / allowed))
-        found.append(TruthResult(name, TRUTH[name][worst], float(off[worst]), float(allowed[worst])))
-    return found
+        results.append(TruthResult(name, TRUTH[name][worst], float(off[worst]), float(allowed[worst])))
+    return results
 
 
 def energy_change(

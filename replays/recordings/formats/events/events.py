@@ -53,19 +53,19 @@ def measure_speeds(motions: Sequence[ChannelMotion], edges: np.ndarray, until_s:
         edges: Keyphasor edges [ticks], shape (turns,).
         until_s: Time up to which only the drive acts [s].
     """
-    found = []
+    speeds = []
     if (speed_channel := next((one for one in motions if one.name == "speed"), None)) is not None:
         rows = max(1, round((min(until_s, 1e6) - speed_channel.axis.first_s) * speed_channel.axis.rate_hz))
         hz = float(np.nanmean(speed_channel.values[:rows]))
-        found.append(Speed(hz, _SPEED_DEVIATION * abs(hz), "the channel `speed`"))
+        speeds.append(Speed(hz, _SPEED_DEVIATION * abs(hz), "the channel `speed`"))
     times = edges[edges < until_s * 1e6]
     times = times if len(times) > 1 else edges
     if len(times) > 1:
         hz = (len(times) - 1) * 1e6 / float(times[-1] - times[0])
-        found.append(Speed(hz, 0.0, "the keyphasor"))
-    if not found and (turned := estimate_speed(motions, until_s=until_s)) is not None:
-        found.append(Speed(*turned, _PROBES))
-    return found
+        speeds.append(Speed(hz, 0.0, "the keyphasor"))
+    if not speeds and (speed_hz := estimate_speed(motions, until_s=until_s)) is not None:
+        speeds.append(Speed(*speed_hz, _PROBES))
+    return speeds
 
 
 class ExperimentDocuments(NamedTuple):

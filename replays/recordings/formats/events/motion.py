@@ -69,13 +69,13 @@ class Impact(NamedTuple):
 
 def detect_impact(motions: Sequence[ChannelMotion]) -> Impact | None:
     """Return the first sudden motion that several channels show, or None."""
-    found = sorted(
+    onsets = sorted(
         (at_s, one.name)
         for one in motions
         if one.kind in ("mm", "N", "m/s^2") and one.axis.rate_hz >= _MIN_RATE_HZ and (at_s := _onset_s(one)) is not None
     )
-    for at_s, _ in found:
-        names = tuple(name for s, name in found if 0.0 <= s - at_s <= _COINCIDENCE_S)
+    for at_s, _ in onsets:
+        names = tuple(name for s, name in onsets if 0.0 <= s - at_s <= _COINCIDENCE_S)
         if len(names) >= _MIN_CHANNELS:
             return Impact(at_s, names, _pulse({one.name: one for one in motions}, at_s))
     return None
@@ -128,10 +128,10 @@ def _pulse(motions: Mapping[str, ChannelMotion], at_s: float) -> tuple[float, fl
     first = force[:, (times >= at_s) & (times < at_s + _PARABOLA_S)].sum(axis=1)
     along = first / max(float(np.hypot(*first)), 1e-30) @ force
     least = max(_MIN_JUMP * float(along[quiet].std()), 1e-3)
-    found, _ = find_pulses(along, TimeAxis(float(times[0]), rate_hz, len(along)), HammerMapping(threshold_n=least))
-    if not found:
+    pulses, _ = find_pulses(along, TimeAxis(float(times[0]), rate_hz, len(along)), HammerMapping(threshold_n=least))
+    if not pulses:
         return None
-    return found[0].at_s, found[0].force_n, found[0].duration_ms, math.degrees(math.atan2(first[1], first[0]))
+    return pulses[0].at_s, pulses[0].force_n, pulses[0].duration_ms, math.degrees(math.atan2(first[1], first[0]))
 
 
 def estimate_speed(motions: Sequence[ChannelMotion], *, until_s: float = math.inf) -> tuple[float, float] | None:

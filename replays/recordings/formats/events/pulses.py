@@ -63,12 +63,12 @@ def find_pulses(
     times_s = axis.instants()
     force = np.nan_to_num(force_n)
     above_s = times_s[np.abs(force) >= wanted.threshold_n]  # both signs, as the hammer rings
-    found: list[HammerPulse] = []
+    pulses: list[HammerPulse] = []
     ignored: list[HammerPulse] = []
     next_allowed_s = -math.inf
     for start, end in find_true_runs(force >= wanted.threshold_n):
         at_s = float(times_s[start])
-        last = found[-1] if found else None
+        last = pulses[-1] if pulses else None
         soon = last is not None and at_s < next_allowed_s
         if last is not None and soon:
             before = int(np.searchsorted(above_s, at_s))
@@ -79,8 +79,8 @@ def find_pulses(
             ignored.append(pulse)
             continue
         next_allowed_s = at_s + (_DEFAULT_DEAD_S if wanted.dead_s is None else wanted.dead_s)
-        found.append(pulse)
-    return found, ignored
+        pulses.append(pulse)
+    return pulses, ignored
 
 
 def _pulse(

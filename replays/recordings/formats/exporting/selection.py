@@ -381,10 +381,10 @@ def _selected_columns(recording: Recording, channels: Sequence[str], *, truth: b
         for name, about in recording.catalogue.get("truth", {}).items()
     }
     if not channels:
-        found = {sensor_key(name): list(range(len(names))) for name, names in groups.items()}
+        columns = {sensor_key(name): list(range(len(names))) for name, names in groups.items()}
         if truth:
-            found |= {truth_key(name): list(range(len(names))) for name, names in truths.items()}
-        return found
+            columns |= {truth_key(name): list(range(len(names))) for name, names in truths.items()}
+        return columns
     places: dict[str, list[tuple[str, int]]] = {}
     for name, names in groups.items():
         places[name] = [(sensor_key(name), c) for c in range(len(names))]

@@ -80,19 +80,19 @@ def _experiment(scene_document: dict[str, Any], recorded: dict[str, Any], source
 def _changes(scene: Scene, base: Scene) -> dict[str, Any]:
     """Return the fields in which a scene differs from another, by dotted key."""
     ours, theirs = scene.model_dump(), base.model_dump()
-    found: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     for key, value in ours.items():
         if key in _EXCLUDED:
             continue
         if isinstance(value, dict):
             other = {} if key == "engine" and value != theirs[key] else theirs[key]  # engines differ in step
-            found |= {f"{key}.{name}": each for name, each in value.items() if other.get(name) != each}
+            changes |= {f"{key}.{name}": each for name, each in value.items() if other.get(name) != each}
         elif value != theirs[key]:
-            found[key] = value
+            changes[key] = value
     before = load_scene(base, {"parameters": scene.parameters}).load_parameters().entries
     now = {key: entry.value for key, entry in scene.load_parameters().entries.items()}
-    found |= {key: value for key, value in now.items() if before[key].value != value}
-    return {key: value for key, value in found.items() if key not in _EXCLUDED}
+    changes |= {key: value for key, value in now.items() if before[key].value != value}
+    return {key: value for key, value in changes.items() if key not in _EXCLUDED}
 
 
 def _first_s(source: Source) -> float:

@@ -75,12 +75,12 @@ class SignalFeatures:
     @cached_property
     def edges(self) -> np.ndarray:
         """Rising edges of a regular pulse train [s], shape (k,); empty for other signals."""
-        found = self.pulses
-        if len(found) < _MIN_EDGES:
+        edges = self.pulses
+        if len(edges) < _MIN_EDGES:
             return np.empty(0)
-        apart = np.diff(found)
+        apart = np.diff(edges)
         uneven = np.abs(np.diff(apart)) / apart[1:] if len(apart) > 1 else np.zeros(1)
-        return found if float(np.median(uneven)) < _MAX_INTERVAL_CHANGE else np.empty(0)
+        return edges if float(np.median(uneven)) < _MAX_INTERVAL_CHANGE else np.empty(0)
 
     @cached_property
     def threshold(self) -> float:

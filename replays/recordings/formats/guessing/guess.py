@@ -206,12 +206,12 @@ def _kind(each: Guess) -> str:
     return kind
 
 
-def _assign_single(channel: str, found: list[Guess], assigned: set[str]) -> None:
+def _assign_single(channel: str, guesses: list[Guess], assigned: set[str]) -> None:
     """Assign the only channel of its kind: to a signal whose name fits, else to the first."""
-    if not found or channel in assigned:
+    if not guesses or channel in assigned:
         return
-    best = next((each for each in found if each.name_parts.kind == channel), found[0])
-    best.assign(channel, LIKELY if len(found) > 1 and best.name_parts.kind != channel else "")
+    best = next((each for each in guesses if each.name_parts.kind == channel), guesses[0])
+    best.assign(channel, LIKELY if len(guesses) > 1 and best.name_parts.kind != channel else "")
     assigned.add(channel)
 
 
@@ -220,14 +220,14 @@ def _stem(each: Guess) -> tuple[str, ...]:
     return tuple(word for word in split_words(each.entry.name) if not read_name(word).axis)
 
 
-def _assign_pairs(kind: str, found: list[Guess], assigned: set[str]) -> None:
+def _assign_pairs(kind: str, guesses: list[Guess], assigned: set[str]) -> None:
     """Assign probes or accelerometers: place and axis by name, pairs by quadrature, disk and ring by amplitude."""
-    for each in found:
+    for each in guesses:
         name = f"{each.name_parts.place}_{each.name_parts.axis}"
         if each.name_parts.place in _PAIRS[kind] and each.name_parts.axis and name not in assigned:
             each.assign(name, "", f"name: {each.name_parts.place}, {each.name_parts.axis}")
             assigned.add(name)
-    pairs = _pairs(kind, [each for each in found if not each.channel])
+    pairs = _pairs(kind, [each for each in guesses if not each.channel])
     open_places = [place for place in _PAIRS[kind] if not {f"{place}_x", f"{place}_y"} & assigned]
     if len(pairs) > len(open_places):
         return  # ambiguous
@@ -246,35 +246,35 @@ def _assign_pairs(kind: str, found: list[Guess], assigned: set[str]) -> None:
         for axis, each in zip("xy", pair, strict=False):
             own = each.name_parts.axis if own_axes else ""
             reasons = [why] if number not in named else [f"name: {place}"]
-            turned = compute_relation(pair[0].features, pair[1].features) if len(pair) == 2 else None
-            if turned is not None and turned.quadrature and kind == "length":
+            relation = compute_relation(pair[0].features, pair[1].features) if len(pair) == 2 else None
+            if relation is not None and relation.quadrature and kind == "length":
                 other = pair[1 - pair.index(each)].entry.name
-                reasons.append(f"90° from {other} at {turned.hz:.3g} Hz")
+                reasons.append(f"90° from {other} at {relation.hz:.3g} Hz")
             reasons += [f"name: {own}"] * bool(own)
             level = ASK if not own else confidence if number not in named else ""
             each.assign(f"{place}_{own or axis}", level, *reasons, ask="; ".join(ask) if each is pair[0] else "")
             assigned.add(each.channel)
 
 
-def _pairs(kind: str, found: list[Guess]) -> list[list[Guess]]:
+def _pairs(kind: str, guesses: list[Guess]) -> list[list[Guess]]:
     """Return pairs of signals at right angles, x first: equal names except for the axis, or quadrature, or file order.
 
     Signals whose named place is already assigned, and lengths without other evidence than their unit, are excluded.
     """
-    found = [each for each in found if not (each.name_parts.place in _PAIRS[kind] and each.name_parts.axis)]
+    guesses = [each for each in guesses if not (each.name_parts.place in _PAIRS[kind] and each.name_parts.axis)]
     stems: dict[tuple[str, ...], list[Guess]] = {}
-    for each in found:
+    for each in guesses:
         if each.name_parts.axis:
             stems.setdefault(_stem(each), []).append(each)
     pairs = [sorted(pair, key=lambda each: each.name_parts.axis) for pair in stems.values() if
              {each.name_parts.axis for each in pair} == {"x", "y"} and len(pair) == 2]  # fmt: skip
-    rest = [each for each in found if all(each is not one for pair in pairs for one in pair)]
+    rest = [each for each in guesses if all(each is not one for pair in pairs for one in pair)]
     while len(rest) > 1:
         a = rest.pop(0)
-        turned = [b for b in rest if (rel := compute_relation(a.features, b.features)) is not None and rel.quadrature]
-        if not turned and not _is_confirmed(kind, a):
+        normal = [b for b in rest if (rel := compute_relation(a.features, b.features)) is not None and rel.quadrature]
+        if not normal and not _is_confirmed(kind, a):
             continue
-        b = (turned or rest)[0]
+        b = (normal or rest)[0]
         rest = [each for each in rest if each is not b]
         pairs.append([a, b])
     return [*pairs, *([each] for each in rest if _is_confirmed(kind, each))]
@@ -289,17 +289,17 @@ def _places(
     kind: str, pairs: list[list[Guess]], named: dict[int, str], free: list[str]
 ) -> tuple[dict[int, str], str, str]:
     """Return the place of each pair by its number, the reason, and the confidence."""
-    left = [place for place in free if place not in named.values()]
+    unused = [place for place in free if place not in named.values()]
     rest = [number for number in range(len(pairs)) if number not in named]
-    if len(rest) == 1 and len(left) == 1:
-        return {**named, rest[0]: left[0]}, f"the remaining pair: {left[0]}", LIKELY
+    if len(rest) == 1 and len(unused) == 1:
+        return {**named, rest[0]: unused[0]}, f"the remaining pair: {unused[0]}", LIKELY
     if kind == "length" and len(rest) == 2 and all(len(pairs[number]) == 2 for number in rest):
         reach = {number: sum(_moves_mm(each) for each in pairs[number]) for number in rest}
         far, near = sorted(rest, key=lambda number: -reach[number])
         if reach[near] and reach[far] > _MIN_DISK_RATIO * reach[near]:
             why = f"pairs move {reach[far] / reach[near]:.2g}:1, the disk more"
             return {**named, far: "disk", near: "ring"}, why, LIKELY
-    return {**named, **dict(zip(rest, left, strict=False))}, f"{' or '.join(left)}: in file order", ASK
+    return {**named, **dict(zip(rest, unused, strict=False))}, f"{' or '.join(unused)}: in file order", ASK
 
 
 def _moves_mm(each: Guess) -> float:
@@ -308,16 +308,16 @@ def _moves_mm(each: Guess) -> float:
     return each.features.spread * size * 1e3
 
 
-def _assign_forces(found: list[Guess], guesses: Sequence[Guess], assigned: set[str]) -> None:
+def _assign_forces(forces: list[Guess], guesses: Sequence[Guess], assigned: set[str]) -> None:
     """Assign force transducers: sides by name, else opposite pairs by their correlation."""
-    others = {each.name_parts.side for each in found}
-    for each in found:
+    others = {each.name_parts.side for each in forces}
+    for each in forces:
         name = f"P_{each.name_parts.resolve_side(others)}"
         if each.name_parts.side and name not in assigned:
             alone = len(others - {""}) == 1 and each.name_parts.side_letter
-            each.assign(name, LIKELY if alone else "", f"name: {name[-1]}", *_opposite(each, found))
+            each.assign(name, LIKELY if alone else "", f"name: {name[-1]}", *_opposite(each, forces))
             assigned.add(name)
-    rest = [each for each in found if not each.channel]
+    rest = [each for each in forces if not each.channel]
     free = [name for name in ("P_N", "P_S", "P_E", "P_W") if name not in assigned]
     if not rest or len(rest) != len(free):
         return
@@ -354,8 +354,8 @@ def _assign_sides(pair: Sequence[Guess], letters: str, why: str, assigned: set[s
 
 def _correlation(pair: Sequence[Guess], probe: Guess) -> float:
     """Return the correlation of the difference of two forces with a probe, as the difference of their correlations."""
-    found = [compute_relation(each.features, probe.features) for each in pair]
-    return sum(sign * each.likeness for sign, each in zip((1.0, -1.0), found, strict=True) if each is not None)
+    relations = [compute_relation(each.features, probe.features) for each in pair]
+    return sum(sign * each.likeness for sign, each in zip((1.0, -1.0), relations, strict=True) if each is not None)
 
 
 def _opposed_pairs(four: list[Guess]) -> list[list[Guess]]:
@@ -364,16 +364,16 @@ def _opposed_pairs(four: list[Guess]) -> list[list[Guess]]:
 
     def opposed(one: Guess) -> float:
         rest = [each for each in others if each is not one]
-        found = [compute_relation(first.features, one.features), compute_relation(rest[0].features, rest[1].features)]
-        return round(sum(each.likeness for each in found if each is not None), 2)
+        pairs = [compute_relation(first.features, one.features), compute_relation(rest[0].features, rest[1].features)]
+        return round(sum(each.likeness for each in pairs if each is not None), 2)
 
     across = min(others, key=opposed)
     return [[first, across], [each for each in others if each is not across]]
 
 
-def _opposite(each: Guess, found: Sequence[Guess]) -> list[str]:
+def _opposite(each: Guess, forces: Sequence[Guess]) -> list[str]:
     """Return the opposite transducer as a reason, if there is one."""
-    alike = {one.entry.name: compute_relation(each.features, one.features) for one in found if one is not each}
+    alike = {one.entry.name: compute_relation(each.features, one.features) for one in forces if one is not each}
     against = {name: one.likeness for name, one in alike.items() if one is not None and one.likeness < _MAX_LIKENESS}
     return [f"against {min(against, key=lambda name: against[name])}"] if against else []
 
@@ -432,9 +432,9 @@ def _scale(each: Guess, unit: str, usual_v: float) -> None:
     if unit == "1":
         return
     if each.volts:
-        found = _SENSITIVITY.search(text)
-        if found is not None and units.get_quantity(found[3]) == units.get_quantity(unit):
-            each.sensitivity = f"{float(found[1].replace(',', '.')):g} {found[2]}/{found[3]}"
+        match = _SENSITIVITY.search(text)
+        if match is not None and units.get_quantity(match[3]) == units.get_quantity(unit):
+            each.sensitivity = f"{float(match[1].replace(',', '.')):g} {match[2]}/{match[3]}"
             each.reasons.append(f"in the file: {each.sensitivity}")
         else:
             each.sensitivity = f"{usual_v:g} V/{unit}"

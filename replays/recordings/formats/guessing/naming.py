@@ -101,13 +101,13 @@ def read_name(name: str) -> ParsedName:
     return ParsedName(kind, kind_word, _find_word(words, _PLACE_OF)[0], axis, side, len(side_word) == 1)
 
 
-def _find_word(words: list[str], known: dict[str, str]) -> tuple[str, str]:
+def _find_word(words: list[str], keys: dict[str, str]) -> tuple[str, str]:
     """Return key and word of the first match: a whole word first, else a long one inside another."""
     for word in words:
-        if word in known:
-            return known[word], word
+        if word in keys:
+            return keys[word], word
     for word in words:
-        for inside, key in known.items():
+        for inside, key in keys.items():
             if len(inside) >= _MIN_INNER_LENGTH and inside in word:
                 return key, inside
     return "", ""

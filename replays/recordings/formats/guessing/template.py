@@ -45,10 +45,10 @@ def guess_mapping(files: Sequence[Path], options: FileOptions | None = None) -> 
         InputError: A file cannot be read.
     """
     sources = [open_source(path, options or FileOptions()) for path in files]
-    known = {source.path: read_attachments(source) for source in sources}
-    exported = {(path, name) for path, each in known.items() for name in each.channels}
+    attached = {source.path: read_attachments(source) for source in sources}
+    exported = {(path, name) for path, each in attached.items() for name in each.channels}
     guesses = guess_channels(sources, exported=lambda source, entry: (source.path, entry.name) in exported)
-    return _text(sources, known, guesses), guesses
+    return _text(sources, attached, guesses), guesses
 
 
 def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
@@ -56,9 +56,9 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
     return guess_mapping(files, options)[0]
 
 
-def _text(sources: Sequence[Source], known: dict[Path, Attachments], guesses: Sequence[Guess]) -> str:
+def _text(sources: Sequence[Source], attached: dict[Path, Attachments], guesses: Sequence[Guess]) -> str:
     lines = [
-        f"# Mapping for `rig import {' '.join(_quoted(path.name) for path in known)} -m THIS.toml -o OUT.mcap`;",
+        f"# Mapping for `rig import {' '.join(_quoted(path.name) for path in attached)} -m THIS.toml -o OUT.mcap`;",
         "# value = sign * factor * (source - bias), in the channel's unit; + is EAST, up, compression. It can be",
         "# imported as it is; lines marked for checking are assumptions. To show a signal in pictures and verdicts,",
         "# rename its [channels.NAME] to one of the rig's (and remove `to` and `to_unit`):",
@@ -74,7 +74,7 @@ def _text(sources: Sequence[Source], known: dict[Path, Attachments], guesses: Se
     if dialect := sources[0].options:
         lines += ["", "[file]", *(f"{key} = {_quoted(value)}" for key, value in dialect.items())]
     lines += _time(guesses)
-    filters, corner_hz = _filters(guesses, known)
+    filters, corner_hz = _filters(guesses, attached)
     lines += filters
     used_names: set[str] = set()
     for each in guesses:
@@ -82,13 +82,13 @@ def _text(sources: Sequence[Source], known: dict[Path, Attachments], guesses: Se
             lines += ["", f"# {_quoted(each.entry.name)} has no numeric values and is omitted"]
             continue
         lines += ["", *_channel(each, used_names, several=len(sources) > 1)]
-        if (channel := known[each.source.path].channels.get(each.entry.name)) is not None:
+        if (channel := attached[each.source.path].channels.get(each.entry.name)) is not None:
             lines += [f"bandwidth_hz = {channel.bandwidth_hz!r}"]
             lines += [f"highpass_hz = {channel.highpass_hz!r}"] * bool(channel.highpass_hz)
         elif each.features.timed and corner_hz > (max_hz := 0.5 * each.features.axis.rate_hz):
             lines += [f"bandwidth_hz = {max_hz:.6g}    # {CHECK}: half of its rate; [defaults] is higher"]
     lines += _event_tables(guesses, several=len(sources) > 1)
-    first, about = sources[0].path, known[sources[0].path]
+    first, about = sources[0].path, attached[sources[0].path]
     if about.experiment:
         lines += ["", f"[experiment]    # as attached to {first.name}", *about.experiment]
     elif about.doubt:
@@ -128,9 +128,9 @@ def _time(guesses: Sequence[Guess]) -> list[str]:
     return ["", comment, "[time]", f'stamps = "line"    # {note}']
 
 
-def _filters(guesses: Sequence[Guess], known: dict[Path, Attachments]) -> tuple[list[str], float]:
+def _filters(guesses: Sequence[Guess], files: dict[Path, Attachments]) -> tuple[list[str], float]:
     """Return the lines on the low-pass filters, and the corner seen in the noise [Hz], else 0."""
-    open_ones = [each for each in guesses if each.channel and each.entry.name not in known[each.source.path].channels]
+    open_ones = [each for each in guesses if each.channel and each.entry.name not in files[each.source.path].channels]
     if not open_ones:
         return [], 0.0
     lines = [
@@ -222,15 +222,15 @@ def _example_table(table: str, guesses: Sequence[Guess]) -> list[str]:
 def _motions(guesses: Sequence[Guess]) -> tuple[list[ChannelMotion], float]:
     """Return the channels on the recording's time axis, and its start in source time [s]."""
     table = default_table().channels
-    known = [each for each in guesses if each.features.timed and each.gain and table[each.channel].unit != "1"]
+    usable = [each for each in guesses if each.features.timed and each.gain and table[each.channel].unit != "1"]
     first = dict[str, float]()
-    for each in known:
+    for each in usable:
         group = table[each.channel].group
         first[group] = max(first.get(group, -math.inf), each.features.axis.first_s)
     zero_s = min(first.values(), default=0.0)
     return [
         ChannelMotion(each.channel, each.gain * (each.features.values - each.zero), each.features.axis.shift(-zero_s))
-        for each in known
+        for each in usable
     ], zero_s
 
 
@@ -239,7 +239,7 @@ def _align_lines(lines: list[str], guesses: Sequence[Guess]) -> list[str]:
     files: dict[str, list[Guess]] = {}
     for each in sorted(guesses, key=lambda each: not len(each.features.edges)):
         files.setdefault(each.entry.name, []).append(each)
-    pair = next((found[:2] for found in files.values() if len({each.source.path for each in found}) > 1), None)
+    pair = next((matches[:2] for matches in files.values() if len({each.source.path for each in matches}) > 1), None)
     if pair is None:
         return lines
     sides = {
@@ -266,16 +266,16 @@ def _channel(each: Guess, used_names: set[str], *, several: bool) -> list[str]:
         f"source = {_quoted(entry.name)}    # {entry.rows} values, {rate}{label}",
     ]
     lines += _location(each, several=several)
-    known = units.is_known(entry.unit) and entry.unit != ""
+    has_unit = units.is_known(entry.unit) and entry.unit != ""
     if not each.channel:
-        target = entry.unit if known else "1"
-        mark = f"    # {CHECK}: the file has {entry.unit!r}" if entry.unit and not known else ""
+        target = entry.unit if has_unit else "1"
+        mark = f"    # {CHECK}: the file has {entry.unit!r}" if entry.unit and not has_unit else ""
         lines += [f"unit = {_quoted(target)}{mark}"]
         group = re.sub(r"\W+", "_", entry.group or each.source.path.stem).strip("_").lower() or "imported"
         group += "_log" if group in default_table().groups else ""
         return [*lines, f"to = {_quoted(group)}", f"to_unit = {_quoted(target)}"]
     fields = {
-        "sign": each.sign if each.sign < 0 else None, "unit": each.unit or (entry.unit if known else None),
+        "sign": each.sign if each.sign < 0 else None, "unit": each.unit or (entry.unit if has_unit else None),
         "sensitivity": each.sensitivity, "bias": each.bias,
     }  # fmt: skip
     for field, value in fields.items():

@@ -78,9 +78,9 @@ def look_into(path: Path, options: FileOptions) -> Source:
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         wanted = [entry.place for entry in entries]
         for columns in batches(wanted if stamps is None else [*wanted, stamps], range(file.num_row_groups)):
-            found = [numbers(column, base) for column in columns]
-            part_s = None if stamps is None else found.pop() * scale
-            yield [FileSignal(values=values, times_s=part_s) for values in found]
+            arrays = [numbers(column, base) for column in columns]
+            part_s = None if stamps is None else arrays.pop() * scale
+            yield [FileSignal(values=values, times_s=part_s) for values in arrays]
 
     kept = {key.decode(): text.decode(errors="replace") for key, text in about.items() if key != b"ARROW:schema"}
     return Source(path, "Parquet", tuple(entries), read, pieces, about=kept, start=start)

@@ -213,30 +213,30 @@ def _time_kind(text: str, layout: Layout, options: FileOptions) -> Any:
 
     if options.time_format is None and layout.dialect.is_number(text):
         return pyarrow.float64()
-    found = instant(text, options.time_format)
-    if found is None:
+    parsed = instant(text, options.time_format)
+    if parsed is None:
         must = "set for times that are not numbers (such as %d.%m.%Y %H:%M:%S)"
         raise InputError("file.time_format", must if options.time_format is None else "that of the times", text)
-    if options.time_format is not None or "," in text or not isinstance(found, datetime):
+    if options.time_format is not None or "," in text or not isinstance(parsed, datetime):
         return pyarrow.string()
-    return pyarrow.timestamp("ns", tz=None if found.tzinfo is None else "UTC")
+    return pyarrow.timestamp("ns", tz=None if parsed.tzinfo is None else "UTC")
 
 
 def _instants(path: Path, column: Any, options: FileOptions) -> Any:
     """Convert texts to instants, or to times of day."""
     import pyarrow
 
-    found: list[Any] = []
+    moments: list[Any] = []
     for text in column.to_pylist():
         moment = instant(str(text), options.time_format)
         if moment is None:
             raise InputError("file.time_format", f"that of the times in {path.name}", str(text))
-        found.append(moment)
+        moments.append(moment)
     kind = pyarrow.float64()
-    if isinstance(found[0], datetime):
-        zoned = getattr(found[0], "tzinfo", None) is not None
+    if isinstance(moments[0], datetime):
+        zoned = getattr(moments[0], "tzinfo", None) is not None
         kind = pyarrow.timestamp("us", tz="UTC" if zoned else None)
-    return pyarrow.array(found, kind)
+    return pyarrow.array(moments, kind)
 
 
 def _quoted(name: str) -> str:

@@ -130,18 +130,18 @@ def find_layout(path: Path, options: FileOptions) -> Layout:
     lines = text.splitlines()
     if lines and lines[0].startswith(_LVM):
         return _lvm_layout(path, text.split("\n"), encoding)
-    found = [layout for dialect in _dialects(options) if (layout := _layout(lines, dialect, encoding, options))]
-    if not found:
+    layouts = [layout for dialect in _dialects(options) if (layout := _layout(lines, dialect, encoding, options))]
+    if not layouts:
         grouped = [Dialect(*marks) for marks in (
             (";", ",", "."), ("\t", ",", "."), (";", ",", " "), ("\t", ",", " "), (",", ".", ","), (";", ".", ","),
             ("\t", ".", ","), (";", ".", "'"), (";", ",", "'"),
         )] if options.thousands is None else []  # fmt: skip
-        found = [layout for dialect in grouped if (layout := _layout(lines, dialect, encoding, options))]
-    if not found:
+        layouts = [layout for dialect in grouped if (layout := _layout(lines, dialect, encoding, options))]
+    if not layouts:
         must = "a text file with lines of numbers (set file.delimiter, decimal, thousands, time_format)"
         raise InputError("file", must, str(path))
     # A layout with column names is preferred; then the one with most numeric columns.
-    layout = max(found, key=lambda item: (item[0], item[1].width))[1]
+    layout = max(layouts, key=lambda item: (item[0], item[1].width))[1]
     dialect = layout.dialect
     if options.delimiter is None:
         shown = {value: key for key, value in _DELIMITERS.items()}.get(dialect.delimiter, dialect.delimiter)

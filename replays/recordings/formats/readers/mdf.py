@@ -84,11 +84,11 @@ def look_into(path: Path, options: FileOptions) -> Source:
         ]
         while True:
             with _suppress_output():
-                found = [next(stream, ()) for stream in streams]
-            if not found[0]:
+                blocks = [next(stream, ()) for stream in streams]
+            if not blocks[0]:
                 return
-            times_s = None if second is None else np.asarray(found[0][0], dtype=float) * second
-            yield [_from_records(part, kind, times_s) for part, kind in zip(found[1:], kinds, strict=True)]
+            times_s = None if second is None else np.asarray(blocks[0][0], dtype=float) * second
+            yield [_from_records(part, kind, times_s) for part, kind in zip(blocks[1:], kinds, strict=True)]
 
     remarks = (f"{texts} non-numeric channels ignored",) if texts else ()
     about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
@@ -100,12 +100,12 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
 def _documents(mdf: Any) -> dict[str, str]:
     """Return the documents that `rig export` attached."""
-    found = {}
+    documents = {}
     for index, attachment in enumerate(getattr(mdf, "attachments", ())):
         if attachment.file_name in DOCUMENTS:
             content, *_ = mdf.extract_attachment(index=index)
-            found[attachment.file_name] = bytes(content).decode(errors="replace")
-    return found
+            documents[attachment.file_name] = bytes(content).decode(errors="replace")
+    return documents
 
 
 def _open(path: Path) -> Any:
@@ -198,9 +198,9 @@ def _find_scale(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
 
 def _signal(mdf: Any, group: int, index: int) -> FileSignal:
     kind, second = _find_scale(mdf, group, index), _time_unit_s(mdf, group)
-    found = mdf.get(group=group, index=index, raw=kind is not None, ignore_invalidation_bits=True)
-    times_s = None if second is None else np.asarray(found.timestamps, dtype=float) * second
-    return _from_records((found.samples, found.invalidation_bits), kind, times_s)
+    data = mdf.get(group=group, index=index, raw=kind is not None, ignore_invalidation_bits=True)
+    times_s = None if second is None else np.asarray(data.timestamps, dtype=float) * second
+    return _from_records((data.samples, data.invalidation_bits), kind, times_s)
 
 
 def _from_records(record: Sequence[Any], linear: tuple[float, float] | None, times_s: np.ndarray | None) -> FileSignal:

@@ -110,8 +110,8 @@ def _rate_hz(head: dict) -> float | None:
 
 
 def _exact(head: dict, name: str) -> float | None:
-    found = re.search(_EXACT.format(name), str(head.get("id4", "")))
-    return float(found[1]) if found else None
+    match = re.search(_EXACT.format(name), str(head.get("id4", "")))
+    return float(match[1]) if match else None
 
 
 def _start(texts: list[str]) -> datetime | None:
@@ -145,18 +145,16 @@ def degrees_of_freedom(recording: Recording) -> dict[str, DegreeOfFreedom]:
     against x. The hammer hits the disk, along the direction of its impacts if that is a common axis.
     """
     directions = {str(event.get("direction")) for event in recording.events if event["event"] == "hammer"}
-    found: dict[str, tuple[str, int]] = {}
+    axes: dict[str, tuple[str, int]] = {}
     for channel in recording.table.channels.values():
-        found[channel.name] = _node_of(
-            channel.name, 6 if units.get_quantity(channel.unit) == "speed of rotation" else 0
-        )
-    if "hammer" in found:
-        found["hammer"] = ("disk", _IMPACT_DIRECTIONS.get(directions.pop(), 0) if len(directions) == 1 else 0)
+        axes[channel.name] = _node_of(channel.name, 6 if units.get_quantity(channel.unit) == "speed of rotation" else 0)
+    if "hammer" in axes:
+        axes["hammer"] = ("disk", _IMPACT_DIRECTIONS.get(directions.pop(), 0) if len(directions) == 1 else 0)
     for table, about in recording.catalogue.get("truth", {}).items():
         for column in about["columns"]:
-            found[f"truth.{table}.{column['name']}"] = _node_of(column["name"], 0)
-    nodes = {place: number for number, place in enumerate(dict.fromkeys(place for place, _ in found.values()), 1)}
-    return {name: DegreeOfFreedom(nodes[place], direction, place) for name, (place, direction) in found.items()}
+            axes[f"truth.{table}.{column['name']}"] = _node_of(column["name"], 0)
+    nodes = {place: number for number, place in enumerate(dict.fromkeys(place for place, _ in axes.values()), 1)}
+    return {name: DegreeOfFreedom(nodes[place], direction, place) for name, (place, direction) in axes.items()}
 
 
 def _node_of(name: str, otherwise: int) -> tuple[str, int]:

@@ -94,11 +94,11 @@ def _read_sidecar(path: Path, channels: int) -> tuple[tuple[_Column, ...], float
     beside = path.with_name(path.name + ".json")
     if not beside.is_file():
         return (_Column(),) * channels, 0.0, None
-    found = check(_Sidecar, beside.read_bytes(), field=beside.name, most_bytes=DOCUMENT_BYTES)
-    table = found.tables[0]
+    sidecar = check(_Sidecar, beside.read_bytes(), field=beside.name, most_bytes=DOCUMENT_BYTES)
+    table = sidecar.tables[0]
     if len(table.columns) != channels:
         raise InputError(beside.name, f"of a file with {channels} channels", len(table.columns))
-    return table.columns, table.first_s, found.start
+    return table.columns, table.first_s, sidecar.start
 
 
 class WavWriter(export.FormatWriter):

@@ -125,12 +125,12 @@ def attribute(
         cured = False
     if until_s > end_s:  # the model must then explain the longer window
         fitted = [candidates[one.name].refit(one, until_s) if one.at_floor else one for one in fitted]
-    found = [*fitted, *sensors, *timed]
+    explanations = [*fitted, *sensors, *timed]
     # Candidates that were given up on a shorter window are last.
-    found.sort(key=lambda one: (-one.to_s, -one.explained))
-    conclusion, best = conclude(found, sensors if cured else [], rules, end_s=until_s)
-    explained = Explained(from_s, until_s, tuple(found), conclusion, best)
-    floor = {one.name: one for one in found if one.at_floor and one.to_s == until_s}
+    explanations.sort(key=lambda one: (-one.to_s, -one.explained))
+    conclusion, best = conclude(explanations, sensors if cured else [], rules, end_s=until_s)
+    explained = Explained(from_s, until_s, tuple(explanations), conclusion, best)
+    floor = {one.name: one for one in explanations if one.at_floor and one.to_s == until_s}
     if until_s >= ends[-1] or not set(best) <= set(floor) & set(candidates):
         return explained
     tied = sorted((floor[name] for name in best), key=lambda one: one.squares)[:_MAX_TIED]
@@ -145,7 +145,7 @@ def _add_second_cause(
     step: Callable[[str], None],
 ) -> Explained:
     """Return the explanation with a second, jointly fitted cause, if the first explains a part of the time only."""
-    found: list[tuple[Explanation, str]] = []
+    joint: list[tuple[Explanation, str]] = []
     for cause in causes:
         from_s = cause.first_off(last_s)
         ends = sorted({min(from_s + length, last_s) for length in _GROWTH_S})
@@ -155,14 +155,14 @@ def _add_second_cause(
         least = np.inf if alone is None else alone.squares - MARGIN
         for one in fitted:
             if one.at_floor and one.to_s == end_s and one.squares < least:
-                found.append((one, f"{cause.candidate.name} {cause.format_value(float(others[one.name].ended[1]))}"))
-        if found and end_s >= ends[-1]:
+                joint.append((one, f"{cause.candidate.name} {cause.format_value(float(others[one.name].ended[1]))}"))
+        if joint and end_s >= ends[-1]:
             break
-    if not found:
+    if not joint:
         return replace(first, conclusion=f"{first.conclusion}; the difference after that is not explained")
-    end_s = max(one.to_s for one, _ in found)
-    fewest = min(one.squares for one, _ in found if one.to_s == end_s)
-    pairs = [(one, cause) for one, cause in found if one.to_s == end_s and one.squares < fewest + MARGIN]
+    end_s = max(one.to_s for one, _ in joint)
+    fewest = min(one.squares for one, _ in joint if one.to_s == end_s)
+    pairs = [(one, cause) for one, cause in joint if one.to_s == end_s and one.squares < fewest + MARGIN]
     named = [replace(one, name=f"{one.name}, with {cause}") for one, cause in pairs]
     changes = " or ".join(f"{one.name} {one.change} with {cause}" for one, cause in pairs)
     return replace(
@@ -288,8 +288,8 @@ class _CandidateFit:
 
     def first_off(self, end_s: float) -> float:
         """Return the time of the first unexplained sample with the result of the last fit, up to an end [s]."""
-        found = self._predicted(self.ended, end_s)
-        off = {} if found is None else {name: np.abs(scaled(self._parts[name], v)) for name, v in found.values.items()}
+        model = self._predicted(self.ended, end_s)
+        off = {} if model is None else {name: np.abs(scaled(self._parts[name], v)) for name, v in model.values.items()}
         rows = {
             name: np.flatnonzero(each[:, smooth_columns(self._parts[name])].max(axis=1, initial=0.0) > _OUTLIER_FLOORS)
             for name, each in off.items()
@@ -334,10 +334,10 @@ class _CandidateFit:
                 places.append((float(np.sum(np.arcsinh(z) ** 2)), abs(part), part, start))
         best: Fit | None = None
         for *_, start in sorted(places, key=lambda place: place[:3])[:_MAX_STARTS]:
-            found = self.fit(start, end_s)
-            if found is not None and (best is None or found.squares < best.squares):
-                best = found
-            if found is not None and is_noise(found.residuals):
+            result = self.fit(start, end_s)
+            if result is not None and (best is None or result.squares < best.squares):
+                best = result
+            if result is not None and is_noise(result.residuals):
                 break
         return best
 
@@ -362,14 +362,14 @@ class _CandidateFit:
         largest = np.array([one.candidate.largest for one in both])
         return fit(residuals, slopes, start, rounds=_MAX_STEPS, gain=_MIN_GAIN, farthest=largest, longest=largest / 4.0)
 
-    def explanation(self, found: Fit, before: float, to_s: float) -> Explanation:
+    def explanation(self, result: Fit, before: float, to_s: float) -> Explanation:
         """Return the explanation by a fit, relative to the excess of the residuals without it."""
-        p, unit, key = float(found.values[0]), self._unit, self.candidate.keys[0]
+        p, unit, key = float(result.values[0]), self._unit, self.candidate.keys[0]
         kind: Kind = "time" if key.endswith(".at_s") else "command" if key.startswith("hammer.") else "model"
         return Explanation.of(
-            found.residuals, kind=kind, name=self.candidate.name,
+            result.residuals, kind=kind, name=self.candidate.name,
             change=self.format_value(p), value=p, unit=unit,
-            explained=1.0 - excess(found.residuals) / before, to_s=to_s,
+            explained=1.0 - excess(result.residuals) / before, to_s=to_s,
         )  # fmt: skip
 
     def before(self, end_s: float) -> float:
@@ -380,21 +380,21 @@ class _CandidateFit:
     def refit(self, one: Explanation, end_s: float) -> Explanation:
         """Return the explanation on a longer window, from the result of the last fit."""
         before = self.before(end_s)
-        found = self.fit(self.ended, end_s)
-        return one if found is None or before == 0.0 else self.explanation(found, before, end_s)
+        result = self.fit(self.ended, end_s)
+        return one if result is None or before == 0.0 else self.explanation(result, before, end_s)
 
 
 def _list_candidates(
     experiment: Experiment, parts: dict[str, Measured], rules: Attribution
 ) -> dict[str, _CandidateFit]:
     """Return the candidates whose numbers an experiment has, by name."""
-    found = {}
+    fits = {}
     for candidate in rules.candidates:
         try:
-            found[candidate.name] = _CandidateFit(experiment, candidate, parts)
+            fits[candidate.name] = _CandidateFit(experiment, candidate, parts)
         except InputError:
             continue  # the experiment has no such number, for example no hammer pulse
-    return found
+    return fits
 
 
 class _WindowStage(NamedTuple):
@@ -425,10 +425,10 @@ def _fit_model(
         fits: dict[str, Fit] = {}
         for name, p in places.items():
             step(f"{name}, to {end_s:.3f} s")
-            found = candidates[name].fit(p, end_s)
-            if found is not None:
-                fits[name] = found
-        if not stages and not any(is_noise(found.residuals) for found in fits.values()):
+            result = candidates[name].fit(p, end_s)
+            if result is not None:
+                fits[name] = result
+        if not stages and not any(is_noise(result.residuals) for result in fits.values()):
             for name in places:
                 step(f"{name}, wider search")
                 far = candidates[name].search(end_s)
@@ -436,7 +436,7 @@ def _fit_model(
                     fits[name] = far
         before = next(iter(candidates.values())).before(end_s) if candidates else 0.0
         explanations = {
-            name: candidates[name].explanation(found, before, end_s) for name, found in fits.items() if before > 0.0
+            name: candidates[name].explanation(result, before, end_s) for name, result in fits.items() if before > 0.0
         }
         stages.append(_WindowStage(end_s, [one for one in explanations.values() if one.explained > 0.0], fits))
         best = max((one.explained for one in explanations.values()), default=0.0)
@@ -450,23 +450,23 @@ def _fit_model(
     # sensitive for a fit.
     chosen = max(range(len(stages)), key=lambda k: (stages[k].rank, k))
     kept = {one.name: one for stage in stages[: chosen + 1] for one in stage.fitted}
-    for name, found in stages[chosen].fits.items():
-        candidates[name].ended = found.values
+    for name, result in stages[chosen].fits.items():
+        candidates[name].ended = result.values
     return list(kept.values()), stages[chosen].end_s
 
 
 def conclude(
-    found: list[Explanation], cured: list[Explanation], rules: Attribution, *, end_s: float
+    explanations: list[Explanation], cured: list[Explanation], rules: Attribution, *, end_s: float
 ) -> tuple[str, tuple[str, ...]]:
     """Return the conclusion from explanations in a sentence, and the names in it.
 
     Args:
-        found: All explanations.
+        explanations: All explanations.
         cured: Sensor faults that together leave only noise; empty if they do not.
         rules: Limits.
         end_s: End of the window of those that were not given up [s].
     """
-    alone = [one for one in found if one.kind != "sensor" and one.to_s == end_s]
+    alone = [one for one in explanations if one.kind != "sensor" and one.to_s == end_s]
     single = max(alone, key=lambda one: one.explained, default=None)
     if cured and (single is None or not single.at_floor or len(cured) == 1):
         names = tuple(one.name for one in cured)
@@ -498,5 +498,5 @@ def _join(names: list[str]) -> str:
     return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
 
 
-def _list(found: list[Explanation]) -> str:
-    return ", ".join(f"{one.name} {one.change}" for one in found)
+def _list(explanations: list[Explanation]) -> str:
+    return ", ".join(f"{one.name} {one.change}" for one in explanations)

@@ -88,15 +88,16 @@ class Shown:
     def price(self) -> float:
         """Least sum of squares that an additional number must remove, above noise and a part of other errors."""
         level = np.ones(len(self.values))  # the level may be off by far more than the motion
-        left = self.left([level], self.values - self.expected)[1]
-        return max(MARGIN, _MIN_SECOND_PART * float(left @ left))
+        residual = self.solve([level], self.values - self.expected)[1]
+        return max(MARGIN, _MIN_SECOND_PART * float(residual @ residual))
 
-    def cost(self, left: np.ndarray, count: int) -> float:
+    def cost(self, residual: np.ndarray, count: int) -> float:
         """Return the cost of a law by its number of parameters and its residual over the floor, shape (n,) or fewer."""
+        squares = float(residual @ residual)
         if self.counts is None:
-            return float(left @ left) + self.price * count
+            return squares + self.price * count
         # Nothing else is wrong: a number costs a part of the residual, however small.
-        return len(self.values) * (math.log(max(1.0, float(left @ left) / max(1, len(left)))) + _MIN_REDUCTION * count)
+        return len(self.values) * (math.log(max(1.0, squares / max(1, len(residual)))) + _MIN_REDUCTION * count)
 
     @cached_property
     def level(self) -> np.ndarray:
@@ -123,8 +124,8 @@ class Shown:
         if held:
             from scipy.integrate import cumulative_trapezoid
 
-            seen = (times_s >= self.lasted_s[0]) & (times_s <= self.times_s[-1])
-            times_s, signal = times_s[seen], signal[seen]
+            inside = (times_s >= self.lasted_s[0]) & (times_s <= self.times_s[-1])
+            times_s, signal = times_s[inside], signal[inside]
             grown = np.exp(held * (times_s - self.lasted_s[0]))
             signal = signal - held * cumulative_trapezoid(grown * signal, times_s, initial=0.0) / grown
         return np.interp(self.times_s, times_s, signal)
@@ -159,13 +160,13 @@ class Shown:
         """Sampling period [s]."""
         return float(np.diff(self.times_s).min())
 
-    def left(self, columns: list[np.ndarray], aim: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def solve(self, columns: list[np.ndarray], aim: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the least-squares factors of columns in the recorded signal, and the residuals over the floor."""
         weights = 1.0 / self.floor
         table = np.column_stack(columns) * weights[:, None]
         goal = (self.values if aim is None else aim) * weights
-        found = solve(table, goal)
-        return found, goal - table @ found
+        factors = solve(table, goal)
+        return factors, goal - table @ factors
 
     def fitted(
         self, law: Callable[[np.ndarray], np.ndarray], starts: list[list[float]], scale: list[float]
@@ -173,20 +174,20 @@ class Shown:
         """Return the numbers of a law with the least residual, from the best of some initial values, and the latter."""
         from scipy.optimize import least_squares
 
-        def left(scaled: np.ndarray) -> np.ndarray:
+        def errors(scaled: np.ndarray) -> np.ndarray:
             return np.nan_to_num((self.values - law(scaled * scale)) / self.floor, nan=1e9, posinf=1e9, neginf=-1e9)
 
-        best = min((np.array(start) / scale for start in starts), key=lambda start: float(np.sum(left(start) ** 2)))
-        found = least_squares(left, best, method="lm", max_nfev=60)
-        return found.x * scale, found.fun
+        best = min((np.array(start) / scale for start in starts), key=lambda start: float(np.sum(errors(start) ** 2)))
+        fit = least_squares(errors, best, method="lm", max_nfev=60)
+        return fit.x * scale, fit.fun
 
     def law(
-        self, name: str, value: float, left: np.ndarray, count: int = 1, change: str = "", *, unit: str | None = None,
-        numbers: Mapping[str, float] | None = None, sure: bool = True,
+        self, name: str, value: float, residual: np.ndarray, count: int = 1, change: str = "", *,
+        unit: str | None = None, numbers: Mapping[str, float] | None = None, sure: bool = True,
     ) -> Law:  # fmt: skip
         """Return a law of this channel, with the unit and, by default, the text of the table of defects."""
         unit = unit_of(name, self.unit) if unit is None else unit
-        return Law(name, change or size_text(name, value, self.unit), value, left, count, unit, numbers or {}, sure)
+        return Law(name, change or size_text(name, value, self.unit), value, residual, count, unit, numbers or {}, sure)
 
 
 @dataclass(frozen=True)
@@ -197,7 +198,7 @@ class Law:
         name: Name in the table of defects, or several: "gain and delay", "open or short".
         change: Size as text.
         value: Size in `unit`.
-        left: Residual over the floor, shape (n,) or fewer.
+        residual: Residual over the floor, shape (n,) or fewer.
         count: Number of fitted numbers.
         unit: Unit of the size, by the table of defects.
         numbers: Gain error and delay [s], if there are any; several channels may share one.
@@ -207,31 +208,31 @@ class Law:
     name: str
     change: str
     value: float
-    left: np.ndarray
+    residual: np.ndarray
     count: int = 1
     unit: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
     sure: bool = True
 
 
-def rms_of(left: np.ndarray) -> float:
+def rms_of(residual: np.ndarray) -> float:
     """Return the root mean square, shape (n,)."""
-    return math.sqrt(float(left @ left) / max(1, len(left)))
+    return math.sqrt(float(residual @ residual) / max(1, len(residual)))
 
 
 def least_at(cost: Callable[[float], float], low: float, high: float) -> float:
     """Return the place of the least cost between two ends."""
     from scipy.optimize import minimize_scalar
 
-    found: Any = minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 1e-9})
-    return float(found.x)
+    minimum: Any = minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 1e-9})
+    return float(minimum.x)
 
 
 def gain_words(gain: float) -> tuple[str, str]:
     """Return the name and the size of the defect for a factor, as text."""
-    known = next((text for factor, text in DEFECTS["gain"].slips if abs(gain / factor - 1.0) < 0.02), "")
+    slip = next((text for factor, text in DEFECTS["gain"].slips if abs(gain / factor - 1.0) < 0.02), "")
     if abs(gain + 1.0) < 0.1:
         return "polarity", DEFECTS["polarity"].words
-    if abs(gain) < 0.05 and not known:
+    if abs(gain) < 0.05 and not slip:
         return "signal", "missing"
-    return "gain", size_text("gain", gain - 1.0) + (f" ({known})" if known else "")
+    return "gain", size_text("gain", gain - 1.0) + (f" ({slip})" if slip else "")

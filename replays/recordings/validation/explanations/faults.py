@@ -75,9 +75,9 @@ def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lam
     total = sum(excess(one.apart) for one in shown)
     off = {x.name: x for x in shown if x.counts is not None or (len(x.values) > MIN_ROWS and not is_noise(x.apart))}
     explain = _ExplanationMaker(total, end_s)
-    found, seen = [], set()
+    faults, names = [], set()
     for a, b in combinations(off.values(), 2):
-        if {a.name, b.name} & seen:
+        if {a.name, b.name} & names:
             continue
         if a.counts is not None:
             times_s = np.intersect1d(a.times_s, b.times_s)
@@ -88,14 +88,14 @@ def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lam
             continue
         pair = _explain_swap(a, b, explain) or (_explain_turn(a, b, explain) if a.counts is None else None)
         if pair is not None:
-            found.append(pair)
-            seen |= {a.name, b.name}
+            faults.append(pair)
+            names |= {a.name, b.name}
     alone = []
     for name, one in off.items():
-        if name not in seen:
+        if name not in names:
             step(f"faults of {name}")
             alone.append(_explain_channel(one, explain))
-    return found + _merge_equal(alone, explain, [one.name for one in shown if one.moves])
+    return faults + _merge_equal(alone, explain, [one.name for one in shown if one.moves])
 
 
 def extend(part: Measured, expected: np.ndarray, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
@@ -109,14 +109,14 @@ def find_others(
     parts: Mapping[str, Measured], nominal: Prediction, channel: Channel
 ) -> dict[Channel, tuple[np.ndarray, np.ndarray]]:
     """Return times and expected signals of the other, varying channels [their units]."""
-    found = {}
+    signals = {}
     for name, part in parts.items():
         values = nominal.values[name]
         for c in smooth_columns(part):
             other, shown = part.channels[c], values[:, c]
             if other.name != channel.name and shown.std() > part.floor[c]:
-                found[other] = part.times_s[: len(shown)], shown
-    return found
+                signals[other] = part.times_s[: len(shown)], shown
+    return signals
 
 
 def _find_onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end_s: float) -> float:
@@ -143,32 +143,32 @@ def are_cause(sensors: list[Explanation], parts: dict[str, Measured], most: floa
     )
 
 
-def select_channels(found: list[Explanation], names: Iterable[str]) -> list[str]:
+def select_channels(explanations: list[Explanation], names: Iterable[str]) -> list[str]:
     """Return the channels that explanations concern."""
-    words = {word for one in found for word in one.name.replace(",", " ").split()}
+    words = {word for one in explanations for word in one.name.replace(",", " ").split()}
     return [name for name in names if name in words]
 
 
-def _is_whole_kind(found: list[Explanation], parts: dict[str, Measured]) -> bool:
+def _is_whole_kind(explanations: list[Explanation], parts: dict[str, Measured]) -> bool:
     """Return whether all channels of a kind differ, but not equally: then the motion differs, not the channels."""
     kinds: dict[str, list[str]] = {}
     for channel in (channel for part in parts.values() for channel in part.channels):
         kinds.setdefault(channel.unit, []).append(channel.name)
     return any(
         len(names) > 2
-        and select_channels(found, names) == names
-        and sum(bool(select_channels([one], names)) for one in found) > 1
+        and select_channels(explanations, names) == names
+        and sum(bool(select_channels([one], names)) for one in explanations) > 1
         for names in kinds.values()
     )
 
 
-def find_common_delay(found: Sequence[Explanation], parts: Mapping[str, Measured]) -> dict[str, float]:
+def find_common_delay(explanations: Sequence[Explanation], parts: Mapping[str, Measured]) -> dict[str, float]:
     """Return the common delay of the channels of a kind [s], if at least half of them were found to have it.
 
     In the other channels the earlier fit has taken the delay for motion.
     """
     units = {channel.name: channel.unit for part in parts.values() for channel in part.channels}
-    for one in found:
+    for one in explanations:
         names = one.channels_and_defect[0].split(", ")
         kind = [name for name, unit in units.items() if unit == units.get(names[0])]
         if one.channels_and_defect[1] == "delay" and len(kind) / 2.0 <= len(names) < len(kind) > 2:
@@ -184,12 +184,13 @@ class _ExplanationMaker:
     to_s: float
 
     def __call__(
-        self, name: str, change: str, value: float, left: np.ndarray, before: np.ndarray, unit: str = ""
+        self, name: str, change: str, value: float, residual: np.ndarray, before: np.ndarray, unit: str = ""
     ) -> Explanation:
-        explained = (excess(before) - excess(left)) / self.total if self.total > 0.0 else 0.0
+        explained = (excess(before) - excess(residual)) / self.total if self.total > 0.0 else 0.0
         return Explanation.of(
-            left, kind="sensor", name=name, change=change, value=value, unit=unit, explained=explained, to_s=self.to_s
-        )
+            residual, kind="sensor", name=name, change=change, value=value, unit=unit, explained=explained,
+            to_s=self.to_s,
+        )  # fmt: skip
 
 
 def _explain_swap(a: Shown, b: Shown, explain: _ExplanationMaker) -> Explanation | None:
@@ -205,18 +206,18 @@ def _explain_swap(a: Shown, b: Shown, explain: _ExplanationMaker) -> Explanation
             volts = np.clip(y.channel.bias_v + y.channel.sensitivity_v * signal, *y.channel.range_v)
             signal = (volts - x.channel.bias_v) / x.channel.sensitivity_v
         shown = x.coupled(times_s, signal)
-        factors, left = x.left([shown, x.level])
+        factors, residual = x.solve([shown, x.level])
         signs.add(math.copysign(1.0, factors[0]) if x.counts is None else 1.0)
         if y.moves and signal.std() > x.noise and abs(factors[0] - min(signs)) > 0.1:
             if x.counts is None:
                 return None
             continue  # it may exceed the range of this converter: the other channel decides
         if not y.moves:
-            (level,), left = x.left([x.level], x.values - shown)
+            (level,), residual = x.solve([x.level], x.values - shown)
             if abs(level) > OUTLIER * x.noise + _FADED_PART * float(np.abs(shown).max()):
                 return None
-        own = min(own, excess(x.left([x.expected, x.level])[1]))
-        crossed = np.concatenate([crossed, left])
+        own = min(own, excess(x.solve([x.expected, x.level])[1]))
+        crossed = np.concatenate([crossed, residual])
     if not len(crossed):
         return None
     if not is_noise(crossed) and excess(crossed) > 0.01 * (own if a.counts is None else excess(before)):
@@ -230,17 +231,17 @@ def _explain_swap(a: Shown, b: Shown, explain: _ExplanationMaker) -> Explanation
 def _explain_turn(a: Shown, b: Shown, explain: _ExplanationMaker) -> Explanation | None:
     """Return the explanation by two probes at another angle, whose signals are rotated by it, or None."""
     ones = np.ones(len(a.expected))
-    (aa, ab, _), left_a = a.left([a.expected, b.expected, ones])
-    (ba, bb, _), left_b = b.left([a.expected, b.expected, ones])
+    (aa, ab, _), residual_a = a.solve([a.expected, b.expected, ones])
+    (ba, bb, _), residual_b = b.solve([a.expected, b.expected, ones])
     angle = math.atan2(ab - ba, aa + bb)
     off = max(abs(aa - bb), abs(ab + ba), abs(math.hypot(aa, ab) - 1.0))
     if not (a.moves and b.moves) or off > _TURN_TOLERANCE or abs(math.sin(angle)) < 3.0 * off:
         return None
-    left = np.concatenate([left_a, left_b])
-    if not is_noise(left) and excess(left) > 0.01 * (excess(a.apart) + excess(b.apart)):
+    residual = np.concatenate([residual_a, residual_b])
+    if not is_noise(residual) and excess(residual) > 0.01 * (excess(a.apart) + excess(b.apart)):
         return None
     before = np.concatenate([a.apart, b.apart])
-    return explain(f"{a.name} and {b.name} angle", size_text("angle", angle), angle, left, before, "rad")
+    return explain(f"{a.name} and {b.name} angle", size_text("angle", angle), angle, residual, before, "rad")
 
 
 @dataclass(frozen=True)
@@ -263,17 +264,17 @@ class _ChannelFault:
         """Return cost and residual with a given gain error or delay, with or without an offset."""
         one = self.shown
         shown = (1.0 + value) * one.expected if kind == "gain" else one.expected_at(one.times_s - value)
-        _, left = one.left([np.ones(len(shown))], one.values - shown)
+        _, residual = one.solve([np.ones(len(shown))], one.values - shown)
         alone = (one.values - shown) / one.floor
-        costs = [(float(alone @ alone), alone), (float(left @ left) + one.price, left)]
+        costs = [(float(alone @ alone), alone), (float(residual @ residual) + one.price, residual)]
         return min(costs, key=lambda pair: pair[0])
 
 
 def _explain_channel(one: Shown, explain: _ExplanationMaker) -> _ChannelFault:
     law = law_of(one)
-    found = explain(f"{one.name} {law.name}", law.change, law.value, law.left, one.apart, law.unit)
-    found = replace(found, sure=law.sure)
-    return _ChannelFault(one, found, found.squares + one.price * law.count, law.numbers)
+    explanation = explain(f"{one.name} {law.name}", law.change, law.value, law.residual, one.apart, law.unit)
+    explanation = replace(explanation, sure=law.sure)
+    return _ChannelFault(one, explanation, explanation.squares + one.price * law.count, law.numbers)
 
 
 def _merge_equal(alone: list[_ChannelFault], explain: _ExplanationMaker, moving: list[str]) -> list[Explanation]:
@@ -281,7 +282,7 @@ def _merge_equal(alone: list[_ChannelFault], explain: _ExplanationMaker, moving:
 
     If most of the varying channels are late, the others are early; if all are, the time is wrong.
     """
-    found = []
+    merged = []
     for kind in ("gain", "delay"):
         of = {one.shown.name: one.numbers[kind] for one in alone if kind in one.numbers}
         while of:
@@ -296,7 +297,7 @@ def _merge_equal(alone: list[_ChannelFault], explain: _ExplanationMaker, moving:
             if len(group) < 2:
                 continue
             alone = [one for one in alone if one not in group]
-            left = np.concatenate([one.by(kind, value)[1] for one in group])
+            residual = np.concatenate([one.by(kind, value)[1] for one in group])
             change = gain_words(1.0 + value)[1] if kind == "gain" else size_text(kind, value)
             names = [one.shown.name for one in group]
             others = [name for name in moving if name not in names]
@@ -305,8 +306,8 @@ def _merge_equal(alone: list[_ChannelFault], explain: _ExplanationMaker, moving:
                     continue
                 names, value, change = others, -value, size_text(kind, -value)
             before = np.concatenate([one.shown.apart for one in group])
-            found.append(explain(f"{', '.join(names)} {kind}", change, value, left, before, DEFECTS[kind].unit))
-    return found + [one.explanation for one in alone]
+            merged.append(explain(f"{', '.join(names)} {kind}", change, value, residual, before, DEFECTS[kind].unit))
+    return merged + [one.explanation for one in alone]
 
 
 class Clock:
@@ -359,9 +360,9 @@ class Clock:
             start_s: Initial value of the shift [s].
         """
         before = excess(self.residuals(np.zeros(1))) if self._kept else 0.0
-        found: list[Explanation] = []
+        explanations: list[Explanation] = []
         if before == 0.0:
-            return found
+            return explanations
         for rates in (False, True):
             done = fit(self.residuals, self._slopes, np.array([start_s, 0.0][: 1 + rates]), rounds=8, gain=1e-5)
             assert done is not None
@@ -370,14 +371,14 @@ class Clock:
             if rates:
                 change, value, unit = f"{change} and {rate * 1e6:+.1f} ppm", rate * 1e6, "ppm"
             explained = 1.0 - excess(done.residuals) / before
-            if explained > 0.0 and (not found or done.squares < found[0].squares - MARGIN):
-                found.append(
+            if explained > 0.0 and (not explanations or done.squares < explanations[0].squares - MARGIN):
+                explanations.append(
                     Explanation.of(
                         done.residuals, kind="time", name="clock" if rates else "time offset", change=change,
                         value=value, unit=unit, explained=explained, to_s=self._end_s,
                     )
                 )  # fmt: skip
-        return found
+        return explanations
 
     def _slopes(self, change: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         length_s = self._end_s - self._first_s

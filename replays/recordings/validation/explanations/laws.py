@@ -81,7 +81,7 @@ def law_of(one: Shown) -> Law:
         laws += _fit_curves(one)
     if one.moves and one.even:
         laws += [*late(one), *filtered(one)]
-    best = min((law for law in laws if law.sure), key=lambda law: one.cost(law.left, law.count))
+    best = min((law for law in laws if law.sure), key=lambda law: one.cost(law.residual, law.count))
     rings = cache(lambda: list(ringing(one)))
     if one.counts is not None:
         # In a narrow band a resonance equals a gain with a delay, or another law with the same band.
@@ -89,41 +89,41 @@ def law_of(one: Shown) -> Law:
         best = replace(best, name=" or ".join(dict.fromkeys(names.split(" or "))))
     rms = rms_of(before)
     if one.counts is None:
-        if is_noise(best.left) or rms_of(best.left) < _EXPLAINED_PART * min(1.0, rms) + 1.0:
+        if is_noise(best.residual) or rms_of(best.residual) < _EXPLAINED_PART * min(1.0, rms) + 1.0:
             return best
     elif rms < (_MAX_ROUNDING if one.moves else OUTLIER):
         return replace(best, sure=False)
     else:
         # Late samples have other noise, which is expected.
         # Impacts are too sharp to interpolate: the median over the rows counts.
-        typical = 1.48 * float(np.median(np.abs(best.left)))
-        drawn = typical < _MAX_NOISE_FACTOR * one.noise / float(one.floor[0]) and _is_white(np.sign(best.left))
-        if is_noise(best.left) or rms_of(best.left) < (_RESAMPLED_PART if drawn else _EXACT_PART) * rms:
+        typical = 1.48 * float(np.median(np.abs(best.residual)))
+        drawn = typical < _MAX_NOISE_FACTOR * one.noise / float(one.floor[0]) and _is_white(np.sign(best.residual))
+        if is_noise(best.residual) or rms_of(best.residual) < (_RESAMPLED_PART if drawn else _EXACT_PART) * rms:
             return best
-        twice = rms_of(best.left) * float(one.floor[0]) / (math.sqrt(2.0) * one.noise) if one.noise > 0.0 else 0.0
-        timed = best.name.split(" or ")[0] in _TIME_LAWS and one.cost(best.left, best.count) < one.cost(before, 0)
-        if timed and abs(twice - 1.0) < _EXACT_PART + 3.0 / math.sqrt(len(before)) and _is_white(best.left):
+        twice = rms_of(best.residual) * float(one.floor[0]) / (math.sqrt(2.0) * one.noise) if one.noise > 0.0 else 0.0
+        timed = best.name.split(" or ")[0] in _TIME_LAWS and one.cost(best.residual, best.count) < one.cost(before, 0)
+        if timed and abs(twice - 1.0) < _EXACT_PART + 3.0 / math.sqrt(len(before)) and _is_white(best.residual):
             return best
         for law in rings():
-            if rms_of(law.left) < 2.0 * _EXACT_PART * rms:  # impacts between samples excite it, too
+            if rms_of(law.residual) < 2.0 * _EXACT_PART * rms:  # impacts between samples excite it, too
                 return law
     return next(_fit_random(one), replace(best, sure=False))
 
 
 def _find_equal_laws(one: Shown, best: Law, others: list[Law]) -> dict[str, None]:
     """Return the names of other laws with an equal residual, which even or small motion does not distinguish."""
-    least, kind = one.cost(best.left, 0) + MARGIN, best.name.partition(" ")[0]
+    least, kind = one.cost(best.residual, 0) + MARGIN, best.name.partition(" ")[0]
     return dict.fromkeys(
         law.name
         for law in others
         if not {law.name, law.name.partition(" ")[0]} & {kind, *_KIN.get(kind, ())}
         and (law.count <= best.count + 1 or law.name in _COMPLEX_LAWS)
-        and one.cost(law.left, 0) < least
+        and one.cost(law.residual, 0) < least
     )
 
 
-def _is_white(left: np.ndarray) -> bool:
-    return abs(float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)) < 0.1
+def _is_white(residual: np.ndarray) -> bool:
+    return abs(float(residual[1:] @ residual[:-1]) / max(float(residual @ residual), 1e-300)) < 0.1
 
 
 def _fit_counts(one: Shown, counts: np.ndarray) -> Iterator[Law]:
@@ -157,54 +157,54 @@ def _fit_steps(one: Shown) -> Iterator[Law]:
     """Yield a coarser rounding of a log's numbers."""
     levels, apart = np.unique(one.values), one.values - one.expected
     step = float(np.diff(levels).min(initial=np.inf))
-    left = (apart - np.clip(apart, -0.5 * step, 0.5 * step)) / one.floor
+    residual = (apart - np.clip(apart, -0.5 * step, 0.5 * step)) / one.floor
     ragged = np.abs((levels - levels[0]) / step % 1.0 - 0.5) < 0.5 - _LEVEL_PART
-    if len(levels) > 1 and step > OUTLIER * one.noise and not ragged.any() and is_noise(left):
-        yield one.law("bits", step, left, 1, f"in steps of {step:.4g} {one.unit}", unit=one.unit)
+    if len(levels) > 1 and step > OUTLIER * one.noise and not ragged.any() and is_noise(residual):
+        yield one.law("bits", step, residual, 1, f"in steps of {step:.4g} {one.unit}", unit=one.unit)
 
 
-def _make_spikes(one: Shown, rows: np.ndarray, left: np.ndarray) -> Law:
+def _make_spikes(one: Shown, rows: np.ndarray, residual: np.ndarray) -> Law:
     size = float(np.median(np.abs(one.values - one.expected)[rows]))
     rate = rows.sum() / max(float(one.times_s[-1] - one.times_s[0]), 1e-9)
-    return one.law("spikes", size, left, 2, f"{rows.sum()} of {size:.4g} {one.unit}, {rate:.3g} per second")
+    return one.law("spikes", size, residual, 2, f"{rows.sum()} of {size:.4g} {one.unit}, {rate:.3g} per second")
 
 
 def _fit_levels(one: Shown) -> Iterator[Law]:
     """Yield offset, gain and constant signals."""
     ones, e = one.level, one.expected
     coupled = one.counts is not None and one.channel.highpass_hz > 0.0
-    (shift,), left = one.left([ones], one.values - e)
-    yield one.law("offset", float(shift), left)
+    (shift,), residual = one.solve([ones], one.values - e)
+    yield one.law("offset", float(shift), residual)
     rests = not one.moves
     if rests and one.counts is None:
         return
     # For a constant signal a gain fits as well as an offset, not better.
     for columns in [[e]] if rests else [[e], [e, ones]]:
-        factors, left = one.left(columns)
+        factors, residual = one.solve(columns)
         what, change = gain_words(gain := float(factors[0]))
         if (what == "signal" and one.counts is not None) or (rests and abs(float(e.mean())) < one.noise):
             continue  # the level is more specific
         if len(columns) > 1 and what == "gain" and not coupled:
             what, change = "gain and offset", f"{change}, {size_text('offset', factors[1], one.unit)}"
         numbers = {"gain": gain - 1.0} if "gain" in what else {}
-        yield one.law(what, gain - 1.0, left, len(columns), change, unit="", numbers=numbers)
+        yield one.law(what, gain - 1.0, residual, len(columns), change, unit="", numbers=numbers)
     if one.counts is not None:
-        (level,), left = one.left([ones])
-        yield _make_level(one, float(level), left)
+        (level,), residual = one.solve([ones])
+        yield _make_level(one, float(level), residual)
 
 
-def _make_level(one: Shown, level: float, left: np.ndarray) -> Law:
+def _make_level(one: Shown, level: float, residual: np.ndarray) -> Law:
     """Return the law of a constant level."""
     e, volts = one.expected, one.channel.bias_v + one.channel.sensitivity_v * level
     if one.channel.highpass_hz > 0.0:
-        return one.law("open, short or stuck", 0.0, left, 1, "nothing")
+        return one.law("open, short or stuck", 0.0, residual, 1, "nothing")
     if abs(volts) < 1e-3 * np.ptp(one.channel.range_v):
-        return one.law("open or short", 0.0, left, 1, DEFECTS["short"].words)
+        return one.law("open or short", 0.0, residual, 1, DEFECTS["short"].words)
     if one.at_begin(level):
-        return one.law("stuck", level, left)
+        return one.law("stuck", level, residual)
     middle = (np.mean(one.channel.range_v) - one.channel.bias_v) / one.channel.sensitivity_v
     beyond = bool(((e - middle) / (level - middle) > 1.0).all())
-    return one.law("open or saturation" if beyond else "open", volts, left, 1, size_text("open", volts))
+    return one.law("open or saturation" if beyond else "open", volts, residual, 1, size_text("open", volts))
 
 
 def _fit_times(one: Shown) -> Iterator[Law]:
@@ -214,17 +214,17 @@ def _fit_times(one: Shown) -> Iterator[Law]:
     t, d = one.times_s - one.times_s[0], one.values - one.expected
     ones, length_s = one.level, float(one.times_s[-1] - one.times_s[0])
     held = 2.0 * math.pi * one.channel.highpass_hz if one.counts is not None else 0.0
-    (rate, _), left = one.left([(1.0 - ones) / held if held else t, ones], d)
-    yield one.law("drift", float(rate), left, 2)
+    (rate, _), residual = one.solve([(1.0 - ones) / held if held else t, ones], d)
+    yield one.law("drift", float(rate), residual, 2)
 
     def levelling(log_s: float) -> tuple[np.ndarray, np.ndarray]:
-        return one.left([-np.exp(-t / math.exp(log_s)), ones], d)
+        return one.solve([-np.exp(-t / math.exp(log_s)), ones], d)
 
     ends = math.log(0.01 * length_s), math.log(3.0 * length_s)
     log_s = least_at(lambda log_s: rms_of(levelling(log_s)[1]), *ends)
-    (far, _), left = levelling(log_s)
+    (far, _), residual = levelling(log_s)
     change = f"{far:+.4g} {one.unit} in {math.exp(log_s):.3g} s"
-    yield one.law("drift", float(far), left, 3, change, unit=one.unit)
+    yield one.law("drift", float(far), residual, 3, change, unit=one.unit)
     if not one.uniform:
         return
     period_s = length_s / (len(t) - 1)
@@ -240,38 +240,38 @@ def _fit_times(one: Shown) -> Iterator[Law]:
 
     peak, span = float(hz[within][size[within].argmax()]), 1.0 / length_s
     # An expected signal with a line there is not hum, unless the residual is noise.
-    own, rest = one.left(columns(peak), one.expected)
+    own, rest = one.solve(columns(peak), one.expected)
     alone = rms_of(rest) < _MAX_OTHER_PART * float(one.expected.std() / one.floor.min())
     for third in (False, True):
         f = least_at(
-            lambda f, third=third: float(np.sum(one.left(columns(f, third), d)[1] ** 2)), peak - span, peak + span
+            lambda f, third=third: float(np.sum(one.solve(columns(f, third), d)[1] ** 2)), peak - span, peak + span
         )
-        factors, left = one.left(columns(f, third), d)
+        factors, residual = one.solve(columns(f, third), d)
         amplitude = math.hypot(factors[1], factors[2])
-        if alone and math.hypot(*own[1:]) > _MAX_OWN_LINE * amplitude and not is_noise(left):
+        if alone and math.hypot(*own[1:]) > _MAX_OWN_LINE * amplitude and not is_noise(residual):
             continue
         change = f"{f:.5g} Hz, {amplitude:.4g} {one.unit}" + (" with its third" if third else "")
-        yield one.law("hum", amplitude, left, 6 if third else 4, change)
+        yield one.law("hum", amplitude, residual, 6 if third else 4, change)
 
 
 def _fit_crosstalk(one: Shown) -> Iterator[Law]:
     """Yield crosstalk from another channel."""
     d, ones = one.values - one.expected, one.level
-    found, count = list[Law](), 4 if one.counts is None else 2
+    laws, count = list[Law](), 4 if one.counts is None else 2
     for other, shown in one.neighbours().items():
-        (part, _), left = one.left([one.coupled(*shown), ones], d)
+        (part, _), residual = one.solve([one.coupled(*shown), ones], d)
         through = abs(part * one.channel.sensitivity_v / other.sensitivity_v)
         change = f"{part:.4g} {one.unit} for a {other.unit} of {other.name}"
         if one.counts is not None and through > 1.0:
             continue  # it cannot be larger than at its source
         if one.counts is not None and through > 0.0:
             change = f"{20.0 * math.log10(through):.3g} dB of {other.name}"
-        found.append(one.law("crosstalk", float(part), left, count, change, unit=""))
-    if found:
+        laws.append(one.law("crosstalk", float(part), residual, count, change, unit=""))
+    if laws:
         # Channels with equal signals, such as opposite sides of a ring, are one source.
-        best = min(found, key=lambda law: one.cost(law.left, count))
-        least = one.cost(best.left, count) + MARGIN
-        alike = [law.change for law in found if one.cost(law.left, count) < least and law is not best]
+        best = min(laws, key=lambda law: one.cost(law.residual, count))
+        least = one.cost(best.residual, count) + MARGIN
+        alike = [law.change for law in laws if one.cost(law.residual, count) < least and law is not best]
         yield replace(best, change=" or ".join([best.change, *alike]))
 
 
@@ -283,10 +283,10 @@ def _fit_curves(one: Shown) -> Iterator[Law]:
     starts = [[reach * part] for part in (0.1, 0.3, 0.6, 1.0, 2.0, 5.0, 15.0)]
     # For a log, the level of the curve's centre is unknown.
     for about in (0.0, float(e.mean())) if log else (0.0,):
-        (end,), left = one.fitted(lambda p, at=about: at + p[0] * np.tanh((e - at) / p[0]), starts, [reach])
-        plain = min(excess(one.left(line)[1]) for line in ([e], [e - about + one.level])) if log else math.inf
-        if abs(end) > _MIN_VISIBLE_PART * reach and excess(left) < _MAX_CURVE_PART * plain:
-            yield one.law("nonlinear", abs(float(end)), left)
+        (end,), residual = one.fitted(lambda p, at=about: at + p[0] * np.tanh((e - at) / p[0]), starts, [reach])
+        plain = min(excess(one.solve(line)[1]) for line in ([e], [e - about + one.level])) if log else math.inf
+        if abs(end) > _MIN_VISIBLE_PART * reach and excess(residual) < _MAX_CURVE_PART * plain:
+            yield one.law("nonlinear", abs(float(end)), residual)
     low, high = float(one.values.min()), float(one.values.max())
     for _ in range(8):  # limits of the recorded signal, less the effect of noise on them
         over, under = e > high, e < low
@@ -295,9 +295,9 @@ def _fit_curves(one: Shown) -> Iterator[Law]:
     # In a log, impacts through a slow filter look limited.
     cut = (e > high).any() or (e < low).any()
     if one.counts is not None and cut and max(abs(low), abs(high)) > _MIN_VISIBLE_PART * reach:
-        left = (one.values - np.clip(e, low, high)) / one.floor
+        residual = (one.values - np.clip(e, low, high)) / one.floor
         change = f"from {low:.4g} to {high:.4g} {one.unit}"
-        yield one.law("saturation", max(abs(low), abs(high)), left, 2, change, unit=one.unit)
+        yield one.law("saturation", max(abs(low), abs(high)), residual, 2, change, unit=one.unit)
 
 
 def _fit_random(one: Shown) -> Iterator[Law]:
@@ -313,7 +313,7 @@ def _fit_random(one: Shown) -> Iterator[Law]:
     if one.counts is not None and one.moves and fades:
         near = _FADING_PART * float(np.ptp(e)) + 2.0 * OUTLIER * float(one.floor[0])
         loud = np.abs(e) > 5.0 * near
-        gone, sound = (float((np.abs(left) < near)[loud].mean()) if loud.any() else 0.0 for left in (one.values, d))
+        gone, sound = (float((np.abs(values) < near)[loud].mean()) if loud.any() else 0.0 for values in (one.values, d))
         if gone + sound > _ALL_PART and min(gone, sound) > _FADING_PART:
             yield one.law("intermittent", gone, one.apart[~off], 2, f"{gone:.2g} of the time nothing")
             return
@@ -336,7 +336,7 @@ def _fit_random(one: Shown) -> Iterator[Law]:
             change = f"{part:.2g} of the time at {level:.4g} {one.unit} ({volts:.3g} V)"
             yield one.law("intermittent", part, one.apart[~off], 2, change)
             return
-    (_,), rest = one.left([np.ones(len(d))], d)
+    (_,), rest = one.solve([np.ones(len(d))], d)
     if one.moves and one.even and (one.counts is not None or _is_white(rest)):
         late_s, delayed, slope = delayed_by(one)
         timed, floor = one.values - delayed, (1.0 if one.counts is None else 1.5) * one.noise
@@ -346,8 +346,8 @@ def _fit_random(one: Shown) -> Iterator[Law]:
         z, plain = (timed - bend / math.sqrt(2.0)) / width, float(rest.std()) * one.floor
         # The more probable of the two laws, each with one number.
         gain = float(np.sum(np.log(plain / width))) + 0.5 * float(rest @ rest / rest.var() - z @ z)
-        seen = rms_s * rms_of(slope) > 2.0 * one.noise
-        if gain > MARGIN and seen and (one.counts is None or _is_white(z)):
+        visible = rms_s * rms_of(slope) > 2.0 * one.noise
+        if gain > MARGIN and visible and (one.counts is None or _is_white(z)):
             change = f"{1e6 * rms_s:.4g} µs about {1e6 * late_s:.4g} µs"
             yield one.law("jitter", rms_s, z / z.std(), 2, change)
             return

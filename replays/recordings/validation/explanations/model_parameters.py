@@ -56,7 +56,7 @@ def explain_by_parameters(
     slopes = predictor.derivatives(at).slopes
     floor = {
         name: floors(
-            part, found := nominal.values[name][: len(part.times_s)], [o.values[name][: len(found)] for o in others]
+            part, fit := nominal.values[name][: len(part.times_s)], [o.values[name][: len(fit)] for o in others]
         )
         for name, part in kept.items()
     }
@@ -68,37 +68,37 @@ def explain_by_parameters(
 
     z = over_floors({name: part.values - nominal.values[name][: len(part.times_s)] for name, part in kept.items()})
     columns = dict(zip(keys, map(over_floors, slopes), strict=True))
-    known = [one.known or (one.value, predictor.scales[n]) for n, one in enumerate(tuned.fitted)]
-    means, deviations = np.array(known).T
+    priors = [one.prior or (one.value, predictor.scales[n]) for n, one in enumerate(tuned.fitted)]
+    means, deviations = np.array(priors).T
     off = (np.array(list(tuned.values.values())) - means) / deviations
     far = np.array([one.beyond for one in tuned.fitted])
-    found, before = [], excess(z) + float(off[far] @ off[far])
+    fits, before = [], excess(z) + float(off[far] @ off[far])
     for one in candidates:
         relative, sizes = _find_sizes(tuned.baseline, one)
         column = sum(size * columns[key] for size, key in zip(sizes, one.keys, strict=True))
         table = np.column_stack([column, *(columns[key] for key in along)])
         square, side = table.T @ table, table.T @ z
-        place = np.arange(1, len(known) + 1)
+        place = np.arange(1, len(priors) + 1)
         square[place, place] += deviations**-2.0
         side[place] -= off / deviations
         change = solve_normal(square, side)
-        left, back = z - table @ change, off + change[1:] / deviations
+        residual, back = z - table @ change, off + change[1:] / deviations
         if abs(change[0]) > one.largest or (np.abs(back) > MAX_PRIOR_DEVIATION).any() or before == 0.0:
             continue
         unit = "" if relative else one.unit or fit_unit(one.keys[0])
         text = f"{100.0 * change[0]:+.3g} %" if relative else f"{change[0]:+.4g} {unit}"
-        found.append(
+        fits.append(
             Explanation.of(
-                left, kind="model", name=one.name, change=text, value=float(change[0]), unit=unit,
-                explained=1.0 - (excess(left) + float(back[far] @ back[far])) / before, to_s=end_s,
+                residual, kind="model", name=one.name, change=text, value=float(change[0]), unit=unit,
+                explained=1.0 - (excess(residual) + float(back[far] @ back[far])) / before, to_s=end_s,
             )
         )  # fmt: skip
     hit_s = first_command_s(tuned.baseline)
-    if not found and shorten and hit_s < end_s:
+    if not fits and shorten and hit_s < end_s:
         # No candidate keeps the fitted values within their priors: across impacts the linearisation is not valid.
         sooner_s = hit_s + _RETRY_FRACTION * (end_s - hit_s)
         return explain_by_parameters(parts, nominal, others, tuned, rules, end_s=sooner_s, shorten=False)
-    return found
+    return fits
 
 
 def find_changes(experiment: Experiment, rules: Attribution, one: Explanation) -> dict[str, float]:

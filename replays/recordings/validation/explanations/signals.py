@@ -54,11 +54,11 @@ class SignalFault(NamedTuple):
 
 def steady_rows(values: np.ndarray, held: int = _MIN_FROZEN_ROWS) -> np.ndarray:
     """Return whether each row is in a stretch of equal numbers, shape (n,)."""
-    found = np.zeros(len(values), dtype=bool)
+    steady = np.zeros(len(values), dtype=bool)
     for begin, end in find_true_runs(np.concatenate([[False], np.diff(values) == 0.0])):
         if end - begin >= held - 1:
-            found[begin - 1 : end] = True
-    return found
+            steady[begin - 1 : end] = True
+    return steady
 
 
 def signal_faults(parts: dict[str, Measured]) -> list[SignalFault]:
@@ -67,20 +67,20 @@ def signal_faults(parts: dict[str, Measured]) -> list[SignalFault]:
     Args:
         parts: Recorded channels, in their whole length.
     """
-    found = []
+    faults = []
     for part in parts.values():
-        found += _find_jumps(part)
+        faults += _find_jumps(part)
         noises = [measure_noise(part.values[:, c]) for c in range(len(part.channels))]
         for c, channel in enumerate(part.channels):
             if channel.signal == "keyphasor":
                 continue  # a pulse is steady, and has rails
-            found += _find_held_values(channel.name, channel.unit, part.times_s, part.values[:, c])
+            faults += _find_held_values(channel.name, channel.unit, part.times_s, part.values[:, c])
             peers = [noises[k] for k, other in enumerate(part.channels) if k != c and other.unit == channel.unit]
             if peers and noises[c] > _NOISE_FACTOR * max(peers):
                 times = noises[c] / float(np.median(peers))
                 text = f"{times:.2g} times that of similar channels"
-                found.append(SignalFault(channel.name, "noise", float(part.times_s[0]), float(part.times_s[-1]), text))
-    return found
+                faults.append(SignalFault(channel.name, "noise", float(part.times_s[0]), float(part.times_s[-1]), text))
+    return faults
 
 
 def _find_jumps(part: Measured) -> list[SignalFault]:
@@ -111,7 +111,7 @@ def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[Si
         until_s: End of the constant speed [s].
         speed_hz: Speed [Hz].
     """
-    steps, found = np.diff(edges_s[edges_s < until_s]), list[SignalFault]()
+    steps, faults = np.diff(edges_s[edges_s < until_s]), list[SignalFault]()
     even = len(steps) if len(steps) >= 3 else 0
     later = np.diff(edges_s[max(0, even - 1) :])
     neighbours = np.maximum([*later[1:2], *later[:-1]], [*later[1:], math.inf]) if len(later) > 1 else later
@@ -119,27 +119,27 @@ def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[Si
     for at in np.flatnonzero(later > _MISSED_TURN * neighbours) + max(0, even - 1):
         begin, end = float(edges_s[at]), float(edges_s[at + 1])
         text = f"none between {begin:.3f} and {end:.3f} s"
-        found.append(SignalFault("keyphasor", "miss-pulses", begin, end, text))
+        faults.append(SignalFault("keyphasor", "miss-pulses", begin, end, text))
     if not even:
-        return found
+        return faults
     turns = steps / np.median(steps)
     a_turn = 1.0 / (float(np.median(steps)) * speed_hz) if speed_hz > 0.0 else 1.0
     if abs(a_turn - 1.0) > _PULSE_TOLERANCE:
         begin, end = float(edges_s[0]), float(edges_s[len(steps)])
         what = "extra-pulses" if a_turn > 1.0 else "miss-pulses"
-        found.append(SignalFault("keyphasor", what, begin, end, f"{a_turn:.3g} pulses per turn"))
+        faults.append(SignalFault("keyphasor", what, begin, end, f"{a_turn:.3g} pulses per turn"))
     for what, rows in (("miss-pulses", turns > 1.5), ("extra-pulses", turns < 0.7)):
         at = np.flatnonzero(rows)
         if len(at):
             begin, end = float(edges_s[at[0]]), float(edges_s[at[-1] + 1])
             text = f"in {len(at)} of {len(steps)} turns, the first at {begin:.3f} s"
-            found.append(SignalFault("keyphasor", what, begin, end, text))
+            faults.append(SignalFault("keyphasor", what, begin, end, text))
     off_s = np.where(np.abs(turns - 1.0) < 0.3, steps - np.median(steps), 0.0)
     for at in np.flatnonzero(np.abs(off_s) > max(_UNEVENNESS * 1.5 * float(np.median(np.abs(off_s))), _UNEVENNESS_S)):
         text = f"the turn that ends at {edges_s[at + 1]:.4f} s is longer than the others by {1e3 * off_s[at]:+.4g} ms: "
         text += "samples are missing or doubled in it" if off_s[at] < 0.0 else "its time jumps"
-        found.append(SignalFault("time", "lost samples", float(edges_s[at]), float(edges_s[at + 1]), text))
-    return found
+        faults.append(SignalFault("time", "lost samples", float(edges_s[at]), float(edges_s[at + 1]), text))
+    return faults
 
 
 def _find_held_values(name: str, unit: str, times_s: np.ndarray, values: np.ndarray) -> list[SignalFault]:
@@ -148,7 +148,7 @@ def _find_held_values(name: str, unit: str, times_s: np.ndarray, values: np.ndar
     rest = np.diff(values[~steady]) == 0.0
     if not len(rest) or rest.mean() > _MAX_EQUAL_PART:
         return []  # its numbers are coarse, or all are equal
-    found = []
+    faults = []
     rails = np.zeros(len(values), dtype=bool)
     for side, level in (("largest", values.max()), ("smallest", values.min())):
         at = steady_rows(np.where(values == level, level, np.arange(len(values)) + level + 1.0), _RAIL_RUN)
@@ -156,13 +156,13 @@ def _find_held_values(name: str, unit: str, times_s: np.ndarray, values: np.ndar
         if at.sum() >= _RAIL_ROWS and (len(runs) > 1 or at.sum() < _MIN_FROZEN_ROWS):
             rails |= at
             text = f"{at.sum()} rows at its {side}, {level:.6g} {unit}, the first at {times_s[runs[0][0]]:.4f} s"
-            found.append(SignalFault(name, "clip", *_find_span(times_s, runs), text))
+            faults.append(SignalFault(name, "clip", *_find_span(times_s, runs), text))
     runs = find_true_runs(steady & ~rails)
     if runs:
         begin, end = _find_span(times_s, runs)
         text = f"the same number in {sum(b - a for a, b in runs)} rows, from {begin:.4f} to {end:.4f} s"
-        found.append(SignalFault(name, "freeze", begin, end, text))
-    return found
+        faults.append(SignalFault(name, "freeze", begin, end, text))
+    return faults
 
 
 def _find_span(times_s: np.ndarray, runs: list[tuple[int, int]]) -> tuple[float, float]:

@@ -82,7 +82,7 @@ def own_faults(
             if last - first > 2 * _MAX_ROWS:
                 ends[channel.name] = partial(show_rows, np.arange(last - _MAX_ROWS, last), *few)
     about = {one.name: one for one in shown}
-    found = []
+    faults = []
     for one in diagnose(shown, max((float(one.times_s[-1]) for one in shown), default=0.0), step):
         its = [about[name] for name in select_channels([one], about)]
         # Relative to the noise, not to the steps of the converter.
@@ -95,14 +95,14 @@ def own_faults(
                 one = replace(one, sure=False, change=f"{one.change}, and at its end {later.name} {later.change}")
         # In so short a time, a held value matches almost any law, except for one that matches each count.
         one = replace(one, sure=one.sure and (end - begin > _MAX_DELAY_S or one.squares == 0.0))
-        found.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
+        faults.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
     # A recording may begin and end within a run.
     begin_s = min(float(part.times_s[0]) for part in parts.values())
     end_s = max(float(part.times_s[-1]) for part in parts.values())
-    others = [one for one in found if not one.name.startswith("keyphasor")]
-    late = any("delay" in one.name for one in found if one not in others)
+    others = [one for one in faults if not one.name.startswith("keyphasor")]
+    late = any("delay" in one.name for one in faults if one not in others)
     edges = _own_edges(*(each[(each > begin_s) & (each < end_s)] for each in (recorded_s, made_s)), late=late)
-    return found if edges is None else [*others, edges]
+    return faults if edges is None else [*others, edges]
 
 
 def _shown(
@@ -161,20 +161,20 @@ def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Exp
     else:
         what, value, change = "open, short or miss-pulses", 1.0, f"{len(lacking)} of {turns}"
     unit = unit_of(alternatives(what)[-1], "")
-    found = Explanation.of(
+    explanation = Explanation.of(
         np.empty(0), kind="sensor", name=f"keyphasor {what}", change=change, value=value, unit=unit,
         explained=0.0, to_s=float(off[-1]),
     )  # fmt: skip
-    return replace(found, from_s=float(off[0]))
+    return replace(explanation, from_s=float(off[0]))
 
 
 def make_signal_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
     """Return the defects of channels as faults of signals."""
-    found = []
+    faults = []
     for one in own:
         names, what = one.channels_and_defect
         text = one.change if one.sure else f"by no known law; closest is {what} {one.change}"
         what, text = (what if one.sure else "differs", f"{text}, ") if what else (one.change, "")
         text += f"from {one.from_s:.4f} to {one.to_s:.4f} s"
-        found.append(SignalFault(names, what, one.from_s, one.to_s, text))
-    return tuple(found)
+        faults.append(SignalFault(names, what, one.from_s, one.to_s, text))
+    return tuple(faults)

@@ -50,38 +50,38 @@ def late(one: Shown) -> Iterator[Law]:
         delayed = spline(one.times_s - late_s)
     earliest_s, latest_s = (-_MAX_LOG_DELAY_S, _MAX_LOG_DELAY_S) if one.counts is None else (_MIN_DELAY_S, _MAX_DELAY_S)
     if earliest_s <= late_s <= latest_s + 2.0 * one.period_s:  # otherwise it is an end of the search range
-        (shift,), left = one.left([ones], one.values - delayed)
+        (shift,), residual = one.solve([ones], one.values - delayed)
         change, of = size_text("delay", late_s), {"delay": late_s}
         yield one.law("delay", late_s, (one.values - delayed) / one.floor, numbers=of)
         if abs(shift) > one.noise:
             text = f"{change}, {size_text('offset', shift, one.unit)}"
-            yield one.law("delay and offset", late_s, left, 2, text, numbers=of)
+            yield one.law("delay and offset", late_s, residual, 2, text, numbers=of)
         if one.counts is not None and abs(late_s) < -_MIN_DELAY_S:
             return  # the delay is negligible
         for columns in [[delayed], [delayed, ones]][one.counts is not None :]:
-            factors, left = one.left(columns)
+            factors, residual = one.solve(columns)
             what, also = gain_words(gain := float(factors[0]))
             if what == "signal":
                 continue  # a missing signal has no delay
-            yield one.law(f"{what} and delay", gain - 1.0, left, 1 + len(columns), f"{also}, {change}", numbers=of)
+            yield one.law(f"{what} and delay", gain - 1.0, residual, 1 + len(columns), f"{also}, {change}", numbers=of)
     if one.counts is None or one.channel.signal == "keyphasor":
         return  # a log's common time is fitted earlier; pulses are judged by their edges
     at, delays = _find_delays(one)
     if len(at) < 6:
         return
     line = fit_line(at, delays)
-    (start, rate), left = one.fitted(
+    (start, rate), residual = one.fitted(
         lambda p: spline(one.times_s - p[0] - p[1] * t), [[line.at_zero, line.slope], [0.0, line.slope]], [1e-6, 1e-6]
     )
     if min(start, start + rate * t[-1]) > _MIN_DELAY_S:
-        yield one.law("clock", 1e6 * float(rate), left, 2)
+        yield one.law("clock", 1e6 * float(rate), residual, 2)
     length_s = float(t[-1])
     starts = []
     for period_s in 2.0 * length_s / np.arange(1.0, 2.0 * _MAX_SEGMENTS / 3.0):
         turn = 2.0 * math.pi * at / period_s
         table = np.column_stack([np.ones(len(at)), np.cos(turn), np.sin(turn)])
         starts.append([*solve(table, delays).tolist(), period_s])
-    (mean_s, a, b, period_s), left = one.fitted(
+    (mean_s, a, b, period_s), residual = one.fitted(
         lambda p: spline(
             one.times_s - p[0] - p[1] * np.cos(2.0 * math.pi * t / p[3]) - p[2] * np.sin(2.0 * math.pi * t / p[3])
         ),
@@ -89,13 +89,13 @@ def late(one: Shown) -> Iterator[Law]:
     )  # fmt: skip
     size = math.hypot(a, b)
     if mean_s - size > _MIN_DELAY_S:
-        yield one.law("wander", size, left, 4, f"{1e6 * size:.4g} µs in {abs(period_s):.4g} s")
+        yield one.law("wander", size, residual, 4, f"{1e6 * size:.4g} µs in {abs(period_s):.4g} s")
 
 
 def _find_delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
     """Return the middles of segments after the first row [s], and their delays [s]."""
     spline, t = one.expected_at, one.times_s - one.times_s[0]
-    slope, at, found = spline.derivative(), [], []
+    slope, at, delays_s = spline.derivative(), [], []
     pieces = np.array_split(np.arange(len(t)), min(_MAX_SEGMENTS, len(t) // MIN_ROWS))
     late_s = delayed_by(one.at(one.times_s[: max(MIN_ROWS, len(t) // 8)]))[0]
     for rows in pieces:
@@ -105,8 +105,8 @@ def _find_delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
             step = time_error(falls, off)
             late_s = float(np.clip(late_s + np.clip(step, -20.0 * one.period_s, 20.0 * one.period_s), -0.02, 0.02))
         at.append(float(t[rows].mean()))
-        found.append(late_s)
-    return np.array(at), np.array(found)
+        delays_s.append(late_s)
+    return np.array(at), np.array(delays_s)
 
 
 def delayed_by(one: Shown) -> tuple[float, np.ndarray, np.ndarray]:
@@ -117,8 +117,8 @@ def delayed_by(one: Shown) -> tuple[float, np.ndarray, np.ndarray]:
     def cost(late_s: float) -> float:
         shown = spline(one.times_s - late_s)
         if one.counts is None:
-            return rms_of(one.left([shown, np.ones(len(shown))])[1])
-        return rms_of(one.left([one.level], one.values - shown)[1])
+            return rms_of(one.solve([shown, np.ones(len(shown))])[1])
+        return rms_of(one.solve([one.level], one.values - shown)[1])
 
     if one.counts is None:
         far = np.linspace(-_MAX_LOG_DELAY_S, _MAX_LOG_DELAY_S, 81) / period_s
@@ -129,7 +129,7 @@ def delayed_by(one: Shown) -> tuple[float, np.ndarray, np.ndarray]:
     def refined(late_s: float) -> float:
         for _ in range(6):
             at = one.times_s - late_s
-            (_, step, _), _ = one.left([spline(at), -slope(at), np.ones(len(at))])
+            (_, step, _), _ = one.solve([spline(at), -slope(at), np.ones(len(at))])
             late_s = float(np.clip(late_s + np.clip(step, -period_s, period_s), -_MAX_DELAY_S, _MAX_DELAY_S))
         return late_s
 
@@ -145,9 +145,9 @@ def filtered(one: Shown) -> Iterator[Law]:
     """Yield a low-pass with another corner."""
     if one.counts is None:
         slope = one.expected_at.derivative()(one.times_s)
-        factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - one.expected)
+        factors, residual = one.solve([slope, np.gradient(slope, one.times_s)], one.values - one.expected)
         lower = "lower" if factors[1] > 0.0 else "higher"
-        yield one.law("bandwidth", float(factors[1]), left, 2, f"{lower} than given", unit="")
+        yield one.law("bandwidth", float(factors[1]), residual, 2, f"{lower} than given", unit="")
     channel = one.channel
     if not one.uniform or not channel.bandwidth_hz:
         return
@@ -170,35 +170,35 @@ def filtered(one: Shown) -> Iterator[Law]:
     if len(one.values) - margin - round(_ENDS_S / one.period_s) < 2 * MIN_ROWS:
         return  # too short
 
-    def left_by(other: np.ndarray | float) -> np.ndarray:
-        left = one.values - wave.apply_response(other / nominal)[begin:][: len(one.values)]
-        left = one.left([one.level], left)[1] if channel.highpass_hz and one.counts is not None else left / one.floor
-        known = slice(margin, -round(_ENDS_S / one.period_s))  # the later signal affects the inverse of a filter
-        left[: known.start] = left[known.stop :] = rms_of(left[known])
-        return left
+    def residual_by(other: np.ndarray | float) -> np.ndarray:
+        y = one.values - wave.apply_response(other / nominal)[begin:][: len(one.values)]
+        y = one.solve([one.level], y)[1] if channel.highpass_hz and one.counts is not None else y / one.floor
+        judged = slice(margin, -round(_ENDS_S / one.period_s))  # the later signal affects the inverse of a filter
+        y[: judged.start] = y[judged.stop :] = rms_of(y[judged])
+        return y
 
     def cost(log_hz: float) -> float:
         settled = min(len(one.values) // 2, round(_SETTLING_PERIODS / math.exp(log_hz) / one.period_s))
-        return rms_of(left_by(through(math.exp(log_hz)))[max(margin, settled) :])
+        return rms_of(residual_by(through(math.exp(log_hz)))[max(margin, settled) :])
 
     grid = np.log(np.geomspace(10.0, 0.98 * channel.bandwidth_hz, 40))
     near, step = min(grid, key=cost), grid[1] - grid[0]
     corner_hz = math.exp(least_at(cost, near - step, min(near + step, grid[-1])))
     margin = max(margin, min(len(one.values) // 2, round(_SETTLING_PERIODS / corner_hz / one.period_s)))
-    left, differs = left_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
+    residual, differs = residual_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
     if one.counts is None:
         delayed = (one.values - delayed_by(one)[1]) / one.floor
-        passed = float((one.values - left * one.floor).std())
+        passed = float((one.values - residual * one.floor).std())
         # For a slow signal a low-pass is a delay; and a low-pass that passes nothing is not an explanation.
-        if max(1.0, rms_of(left)) < _MAX_RATIO * rms_of(delayed) and passed > _MIN_PASS * float(one.expected.std()):
-            yield one.law("bandwidth", corner_hz, left, 1, f"lower than given: {corner_hz:.3g} Hz")
+        if max(1.0, rms_of(residual)) < _MAX_RATIO * rms_of(delayed) and passed > _MIN_PASS * float(one.expected.std()):
+            yield one.law("bandwidth", corner_hz, residual, 1, f"lower than given: {corner_hz:.3g} Hz")
         return
-    if rms_of(left) < _MAX_NOISE_PART * max(1.0, one.noise / float(one.floor[0])):  # else independent noise
-        seen = rms_of(differs) > _MIN_SETTLED_PART * rms_of(one.apart)
-        yield one.law("bandwidth", corner_hz, left, sure=seen)
-    if one.bare is not None and (rms_of(left_by(1.0)) < _MAX_ALIAS_PART * rms_of(one.apart)):
-        _, left = one.left([one.level] if channel.highpass_hz else [np.zeros(len(one.values))], one.values - one.bare())
-        yield one.law("no-filter", 0.0, left)
+    if rms_of(residual) < _MAX_NOISE_PART * max(1.0, one.noise / float(one.floor[0])):  # else independent noise
+        resolved = rms_of(differs) > _MIN_SETTLED_PART * rms_of(one.apart)
+        yield one.law("bandwidth", corner_hz, residual, sure=resolved)
+    if one.bare is not None and (rms_of(residual_by(1.0)) < _MAX_ALIAS_PART * rms_of(one.apart)):
+        column = one.level if channel.highpass_hz else np.zeros(len(one.values))
+        yield one.law("no-filter", 0.0, one.solve([column], one.values - one.bare())[1])
 
 
 def _find_wave(one: Shown) -> tuple[int, Spectrum]:
@@ -218,20 +218,20 @@ def ringing(one: Shown) -> Iterator[Law]:
     begin, wave = _find_wave(one)
     t = one.times_s - one.times_s[0]
 
-    def left(logs: np.ndarray) -> np.ndarray:
+    def residual(logs: np.ndarray) -> np.ndarray:
         w, quality = 2.0 * math.pi * math.exp(logs[0]), 0.5 + math.exp(logs[1])
         response = w**2 / (wave.turn**2 + wave.turn * w / quality + w**2)
         shown = wave.apply_response(response)[begin:][: len(t)]
         fading, angle = np.exp(-0.5 * w / quality * t), w * math.sqrt(1.0 - 0.25 / quality**2) * t
-        return one.left([fading * np.cos(angle), fading * np.sin(angle), one.level], one.values - shown)[1]
+        return one.solve([fading * np.cos(angle), fading * np.sin(angle), one.level], one.values - shown)[1]
 
     def cost(logs: np.ndarray) -> float:
-        return math.log(rms_of(left(logs)))
+        return math.log(rms_of(residual(logs)))
 
     # x'' = w^2 (e - x) - (w / quality) x' has both numbers, approximately for impacts; else one of many starts.
     shown = make_interp_spline(t, one.values, k=5)
     pulls = [one.expected - one.values, -shown.derivative()(t)]
-    (stiff, damping), _ = one.left(pulls, shown.derivative(2)(t))
+    (stiff, damping), _ = one.solve(pulls, shown.derivative(2)(t))
     starts = [
         np.log([hz, quality - 0.5])
         for hz in np.geomspace(*_RINGS_HZ, _RING_STARTS)
@@ -240,7 +240,7 @@ def ringing(one: Shown) -> Iterator[Law]:
     if stiff > 0.0 and damping > 0.0 and math.sqrt(stiff) > 0.5 * damping:
         starts.append(np.log([math.sqrt(stiff) / 2.0 / math.pi, math.sqrt(stiff) / damping - 0.5]))
     close = {"xatol": 1e-7, "fatol": 1e-3}
-    found: Any = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options=close)
-    hz, quality = math.exp(found.x[0]), 0.5 + math.exp(found.x[1])
+    minimum: Any = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options=close)
+    hz, quality = math.exp(minimum.x[0]), 0.5 + math.exp(minimum.x[1])
     if 0.5 * _RINGS_HZ[0] < hz < 2.0 * _RINGS_HZ[1] and quality < _MAX_QUALITY:
-        yield one.law("resonance", hz, left(found.x), 4, f"at {hz:.4g} Hz, quality {quality:.3g}")
+        yield one.law("resonance", hz, residual(minimum.x), 4, f"at {hz:.4g} Hz, quality {quality:.3g}")
