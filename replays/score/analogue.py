@@ -125,8 +125,8 @@ def fit_channels(
             remarks.append(f"{name}: the file gives no sample rate; the session's, {channel.rate_hz:g} Hz, is assumed")
         values, has_unit = in_unit(signal, channel)
         if not has_unit:
-            given = "no unit" if signal.unit in ("", "1") else f"the unit {signal.unit}"
-            remarks.append(f"{name}: the file gives {given}; {channel.unit} is assumed")
+            unit_text = "no unit" if signal.unit in ("", "1") else f"the unit {signal.unit}"
+            remarks.append(f"{name}: the file gives {unit_text}; {channel.unit} is assumed")
         sent, first_s, sent_hz = session.whole(wire.channel)
         formula, rate_hz = formulas.get(wire.channel), signal.rate_hz or sent_hz
         if formula is None:
@@ -143,17 +143,17 @@ def fit_channels(
             name, channel, wire, values, begin_s, rate_hz, stimulus if parts is None else parts[0], first_s
         )
         tables.setdefault(id(signal.table), []).append(source)
-    found, alignments = [], []
+    fits, alignments = [], []
     for sources in tables.values():
         if (alignment := align(sources)) is None:
             continue
         alignments.append(alignment)
         for source in sources:
-            known = None if source.wire.channel in formulas else _converter(session, source.channel)
-            one = _fit(source, alignment, parts_of[source.name], known)
+            converter = None if source.wire.channel in formulas else _converter(session, source.channel)
+            one = _fit(source, alignment, parts_of[source.name], converter)
             if one is not None and (one.good or source.name == source.wire.channel or not source.wire.rivals):
-                found.append(one)
-    return found, alignments
+                fits.append(one)
+    return fits, alignments
 
 
 def _converter(session: Session, channel: Channel) -> Converter:
@@ -173,7 +173,7 @@ def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
 
 
 def _fit(
-    source: RowSource, alignment: Alignment, parts: tuple[Sampled, Sampled, Sampled] | None, known: Converter | None
+    source: RowSource, alignment: Alignment, parts: tuple[Sampled, Sampled, Sampled] | None, converter: Converter | None
 ) -> Fitted | None:
     name, channel, stimulus = source.name, source.channel, source.stimulus
     values, times_s, curve = alignment.even(source)
@@ -195,9 +195,9 @@ def _fit(
         alias, amounts = _fit_alias(clean, [each(at_s)[0] for each in parts[1:]])
         folds = scale_interval(amounts, 1.0 / abs(low.gain))
         clean = replace(clean, residual=clean.residual - alias)
-    if known and isinstance(stimulus, Sampled):
-        known = replace(known, values=stimulus.find_nearest(clean.times_s + low.late_at(clean.times_s)))
-    rounding = find_undithered(clean, find_step(source.values), known)
+    if converter and isinstance(stimulus, Sampled):
+        converter = replace(converter, values=stimulus.find_nearest(clean.times_s + low.late_at(clean.times_s)))
+    rounding = find_undithered(clean, find_step(source.values), converter)
     low = widen_intervals(low, rounding)
     return Fitted(
         name,
@@ -208,23 +208,23 @@ def _fit(
         corner_hz,
         odd,
         values,
-        known.error if known else 0.0,
+        converter.error if converter else 0.0,
         folds,
         alias,
         rounding,
     )
 
 
-def _fit_alias(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
+def _fit_alias(fit: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
     """Return the aliased part of a residual, and its gain relative to the sent part with its 95 % interval.
 
     Args:
-        found: A fit of the part below half of the rate.
+        fit: A fit of the part below half of the rate.
         above: The part above at the fitted instants, and a quarter of a period later, each shape (n,).
     """
-    matrix = np.column_stack([*above, found.known, found.slope, np.ones(len(found.known))])
-    parts = solve(matrix, found.residual)
-    covariance, dof = sandwich(matrix, found.residual - matrix @ parts)
+    matrix = np.column_stack([*above, fit.sent, fit.slope, np.ones(len(fit.sent))])
+    parts = solve(matrix, fit.residual)
+    covariance, dof = sandwich(matrix, fit.residual - matrix @ parts)
     amount = max(float(np.linalg.norm(parts[:2])), 1e-300)
     way = parts[:2] / amount
     half = float(student(dof[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
@@ -236,27 +236,27 @@ def score_analogue(
     formulas: Mapping[str, Formula],
 ) -> list[Fitted]:  # fmt: skip
     """Add the rows of the analogue path to a scorecard, and return the fits of its channels."""
-    found, alignments = fit_channels(recorded, wires, session, formulas, card.remarks)
-    fitted = {one.name for one in found}
+    fits, alignments = fit_channels(recorded, wires, session, formulas, card.remarks)
+    fitted = {one.name for one in fits}
     _score_rows(card, alignments, recorded)
     for name, wire in wires.items():
         if name not in fitted:
             note = "no sent signal explains it" if wire.channel else "no channel is similar"
             card.add("gain", name, None, note=note)
     ambiguous = {name for each in alignments if each.ambiguous for name in each.names}
-    _score_time(card, [one for one in found if one.good], ambiguous)
-    _score_wires(card, recorded, wires, found, ambiguous, session, alignments)
+    _score_time(card, [one for one in fits if one.good], ambiguous)
+    _score_wires(card, recorded, wires, fits, ambiguous, session, alignments)
     sines = []
-    for one in found:
+    for one in fits:
         _score_fit(card, one)
         sines.append(_score_sine(card, one))
         card.pictures[f"analogue {one.name}"] = one
     for quantity in (
-        *(() if any(sines) else _SINE), *(() if any(one.folds for one in found) else ("alias rejection",)),
+        *(() if any(sines) else _SINE), *(() if any(one.folds for one in fits) else ("alias rejection",)),
         "trigger row",
     ):  # fmt: skip
         card.add(quantity, "", None)
-    return found
+    return fits
 
 
 def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[str, Recorded]) -> None:
@@ -321,30 +321,30 @@ def _count_missing_values(alignment: Alignment, recorded: Mapping[str, Recorded]
     return {name: count for name, count in lost.items() if count}
 
 
-def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> None:
+def _score_time(card: Scorecard, fits: list[Fitted], ambiguous: set[str]) -> None:
     """Add the common clock of all channels, the start of the middle one, and the skew of the others against it."""
     # The median channel is the reference, so that a single wrong one does not change the others' results.
-    middle_s = float(np.median([one.low.middle_s for one in found])) if found else 0.0
+    middle_s = float(np.median([one.low.middle_s for one in fits])) if fits else 0.0
 
     def late_s(one: Fitted) -> float:
         # At the same instant, by the mean time error and the clock: the drift alone is known less well.
         return one.low.late_s + one.low.drift * (middle_s - one.low.middle_s)
 
-    inner = sorted((one for one in found if not one.odd), key=late_s) or found
+    inner = sorted((one for one in fits if not one.odd), key=late_s) or fits
     if not inner:
         return
-    reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else found[0]
+    reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else fits[0]
     low = reference.low
-    halves = np.maximum([one.low.half_widths[3] for one in found], 1e-15)
-    drifts = np.array([one.low.drift for one in found])
-    middle = np.sort(drifts)[(len(found) - 1) // 2] if len(found) > 2 else low.drift
+    halves = np.maximum([one.low.half_widths[3] for one in fits], 1e-15)
+    drifts = np.array([one.low.drift for one in fits])
+    middle = np.sort(drifts)[(len(fits) - 1) // 2] if len(fits) > 2 else low.drift
     own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * halves, _OWN_CLOCK[1])
-    bend_halves = np.maximum([one.low.half_widths[4] for one in found], 1e-15)
-    bends = np.array([one.low.bend for one in found])
+    bend_halves = np.maximum([one.low.half_widths[4] for one in fits], 1e-15)
+    bends = np.array([one.low.bend for one in fits])
     for quantity, values, half, others in (("clock", drifts, halves, own), ("clock drift", bends, bend_halves, own)):
         weights = np.where(others, 0.0, half**-2.0)
-        clocks = [("", *pool_estimates(values, weights, equal_errors=any(one.rounding for one in found)))]
-        clocks += [(found[n].name, values[n], half[n]) for n in np.flatnonzero(others) if quantity == "clock"]
+        clocks = [("", *pool_estimates(values, weights, equal_errors=any(one.rounding for one in fits)))]
+        clocks += [(fits[n].name, values[n], half[n]) for n in np.flatnonzero(others) if quantity == "clock"]
         for name, value, wide in clocks:
             # Its clock runs fast if the session's time advances slowly relative to it.
             note = "differs from the clock of the others" if name else ""
@@ -359,7 +359,7 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
     card.add("start", reference.name, start, of=reference.channel, note=note)
     if open_:
         card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["start"].run)
-    for one in found:
+    for one in fits:
         if one is not reference:
             apart = late_s(one) - late_s(reference)
             both = math.hypot(one.low.half_widths[2], low.half_widths[2])
@@ -386,11 +386,11 @@ def _is_biased(signal: Recorded, channel: Channel) -> bool:
 
 
 def _score_wires(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], found: list[Fitted],
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], fitted: list[Fitted],
     ambiguous: set[str], session: Session, alignments: Sequence[Alignment],
 ) -> None:  # fmt: skip
     """Add mapping and polarity of the signals with a gain; a signal with a channel's name must be that channel."""
-    fits = {one.name: one for one in found if one.good}
+    fits = {one.name: one for one in fitted if one.good}
     signs = {name: one.low.gain > 0.0 for name, one in fits.items()}
     # A start half a period later inverts all channels of a table, not their biases: one known sign fixes the others.
     fixed = {
@@ -442,12 +442,12 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
     add("offset", make_interval(low.offset, low.half_widths[1]) if one.good else None, one.rounding_note)
     # It is unknown whether the rig's own noise, which is in its samples, was in the DAQ's input.
     split = split_noise(one.clean, floor=one.known_noise, steps=bool(one.rounding))
-    noise = split.noise if one.good else split.left
+    noise = split.noise if one.good else split.total
     add("noise", noise)
     add("jitter", scale_interval(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
     full = channel.adc_v / abs(channel.sensitivity_v)
-    left = split_noise(replace(one.clean, residual=one.clean.residual + one.alias), floor=one.known_noise).left
-    bits = [math.log2(full / max(left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
+    total = split_noise(replace(one.clean, residual=one.clean.residual + one.alias), floor=one.known_noise).total
+    bits = [math.log2(full / max(total[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
     ranges = [20.0 * math.log10(full / max(noise[n], 1e-12 * full) / math.sqrt(2.0)) for n in (0, 2, 1)]
     add("effective bits", (bits[0], bits[1], bits[2]))
     add("dynamic range", (ranges[0], ranges[1], ranges[2]))
@@ -472,10 +472,10 @@ def _score_sine(card: Scorecard, one: Fitted) -> bool:
     at = int(np.argmax(np.diff(gaps)))
     values = one.values[gaps[at] : gaps[at + 1] - 1]
     # A session's samples that are a sine within their noise may have harmonics below it.
-    if one.known_noise or len(values) < _MIN_ROWS or not is_sine(one.low.known[:_MAX_SINE_SAMPLES], 0.0):
+    if one.known_noise or len(values) < _MIN_ROWS or not is_sine(one.low.sent[:_MAX_SINE_SAMPLES], 0.0):
         return False
     fit = fit_sine(values)
-    found = quality(fit)
-    for quantity, estimate in zip(_SINE, (found.sinad_db, found.enob, found.thd_db, found.sfdr_db), strict=True):
+    score = quality(fit)
+    for quantity, estimate in zip(_SINE, (score.sinad_db, score.enob, score.thd_db, score.sfdr_db), strict=True):
         card.add(quantity, one.name, estimate, of=one.channel, amplitude=fit.amplitude[0])
     return True

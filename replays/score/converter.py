@@ -20,9 +20,9 @@ _MAX_ROWS = 1 << 17
 """Rows by which crosstalk is judged: more cost time, and 1e5 resolve -100 dB."""
 
 
-def score_converter(card: Scorecard, found: Sequence[Fitted]) -> None:
+def score_converter(card: Scorecard, fits: Sequence[Fitted]) -> None:
     """Add intermodulation, INL, DNL, crosstalk and step response of the channels whose gain is found."""
-    good = [one for one in found if one.good]
+    good = [one for one in fits if one.good]
     for one in good:
         _score_nonlinearity(card, one)
         _score_steps(card, one)
@@ -35,20 +35,20 @@ def score_converter(card: Scorecard, found: Sequence[Fitted]) -> None:
 
 def _score_nonlinearity(card: Scorecard, one: Fitted) -> None:
     clean, low, channel = one.clean, one.low, one.channel
-    distortion = intermodulation(clean.times_s, clean.known, clean.residual, clean.gain)
+    distortion = intermodulation(clean.times_s, clean.sent, clean.residual, clean.gain)
     if distortion is not None:
         card.add("IMD", one.name, distortion, of=channel)
-    found = transfer_curve(low.times_s, low.known, low.values, 2.0 * channel.adc_v / abs(channel.sensitivity_v))
-    if found is not None:
-        card.add("INL", one.name, found.inl, of=channel, note=f"over {found.coverage:.0%} of the range")
-        card.add("DNL", one.name, found.dnl, of=channel, note=f"{found.code_samples:.3g} samples per code")
+    curve = transfer_curve(low.times_s, low.sent, low.values, 2.0 * channel.adc_v / abs(channel.sensitivity_v))
+    if curve is not None:
+        card.add("INL", one.name, curve.inl, of=channel, note=f"over {curve.coverage:.0%} of the range")
+        card.add("DNL", one.name, curve.dnl, of=channel, note=f"{curve.code_samples:.3g} samples per code")
 
 
 def _score_steps(card: Scorecard, one: Fitted) -> None:
     low, channel = one.low, one.channel
-    if not has_steps(low.known):
+    if not has_steps(low.sent):
         return
-    response = step_response(low.known, low.values)
+    response = step_response(low.sent, low.values)
     row_s = float(np.median(np.diff(low.times_s)))
     rise = settling = overshoot = None
     note = "too few steps with long enough plateaus"
@@ -66,7 +66,7 @@ def _score_crosstalk(card: Scorecard, one: Fitted, others: Sequence[Fitted]) -> 
     times_s = clean.times_s[rows]
     sources, names = [], []
     for other in others:
-        volts = other.low.known * abs(other.channel.sensitivity_v)
+        volts = other.low.sent * abs(other.channel.sensitivity_v)
         if np.std(volts) > other.channel.noise_v and np.ptp(other.low.times_s) > 0.5 * np.ptp(times_s):
             sources.append(np.interp(times_s, other.low.times_s, volts))
             names.append(other.name)
@@ -74,7 +74,7 @@ def _score_crosstalk(card: Scorecard, one: Fitted, others: Sequence[Fitted]) -> 
         return
     volts = clean.residual[rows] * abs(one.channel.sensitivity_v)
     size_v = abs(one.channel.sensitivity_v)
-    own = [size_v * clean.known[rows], clean.slope[rows]]
+    own = [size_v * clean.sent[rows], clean.slope[rows]]
     errors = size_v * find_rounding_errors(clean, one.rounding, rows)
     worst, part = find_crosstalk(volts, own, sources, size_v * one.known_noise, errors)
     if part is None:

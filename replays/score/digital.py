@@ -35,22 +35,22 @@ _EDGE_ROWS = 1 << 17
 
 
 def score_digital(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], taken: Mapping[str, SignalRows],
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], matches: Mapping[str, SignalRows],
     session: Session, arrivals: Arrivals | None = None,
 ) -> None:  # fmt: skip
     """Add the rows of the digital path to a scorecard, with the latency if the arrival times of rows are known."""
-    for name, each in taken.items():
+    for name, each in matches.items():
         _score_scale(card, name, each.scale, session.channels[wires[name].channel])
-    coarse = [each.scale for each in taken.values() if each.scale.rounding]
+    coarse = [each.scale for each in matches.values() if each.scale.rounding]
     for bits, rounding in dict.fromkeys((scale.bits, scale.rounding) for scale in coarse):
         card.remarks.append(f"counts of {bits} bits, rounded {rounding}, are compared; the rig's lower bits are not")
     tables: dict[tuple[float, ...], list[str]] = {}
-    for name in sorted(taken, key=lambda each: not taken[each].scale.known):
+    for name in sorted(matches, key=lambda each: not matches[each].scale.known):
         rate_hz = session.rate_hz(session.channels[wires[name].channel].group)
-        table = recorded[name].rows, rate_hz, taken[name].step, taken[name].phase, taken[name].early
+        table = recorded[name].rows, rate_hz, matches[name].step, matches[name].phase, matches[name].early
         tables.setdefault(table, []).append(name)
     for names in tables.values():
-        _score_rows(card, names, wires, recorded, taken, session, arrivals)
+        _score_rows(card, names, wires, recorded, matches, session, arrivals)
 
 
 def _exact(count: float) -> Interval:
@@ -66,12 +66,12 @@ def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel) -> 
 
 def _score_rows(
     card: Scorecard, names: Sequence[str], wires: Mapping[str, Wire], recorded: Mapping[str, Recorded],
-    taken: Mapping[str, SignalRows], session: Session, arrivals: Arrivals | None,
+    matches: Mapping[str, SignalRows], session: Session, arrivals: Arrivals | None,
 ) -> None:  # fmt: skip
     """Compare the rows of signals of equal length, and add their events and stamps to a scorecard."""
     groups = list(dict.fromkeys(session.channels[wires[name].channel].group for name in names))
     table = "all groups" if len(groups) == len(session.groups) > 1 else ", ".join(groups)
-    by_name, one = {name: taken[name].scale for name in names}, taken[names[0]]
+    by_name, one = {name: matches[name].scale for name in names}, matches[names[0]]
     sound = sum(scale.known for scale in by_name.values())
     if not sound:
         for name in names:
@@ -86,14 +86,14 @@ def _score_rows(
     beside = recorded[names[0]].table
     stamps, delays, longest_s = Stamps(beside), Stamps(beside, shown=True), -math.inf
 
-    def counts(left: int) -> Iterator[np.ndarray]:
+    def counts(skip: int) -> Iterator[np.ndarray]:
         all_parts = (each.parts([recorded[name].column for name in inside]) for each, inside in tables.items())
         for parts in zip(*all_parts, strict=True):
-            parts, left = [part[left:] for part in parts], max(0, left - len(parts[0]))
+            parts, skip = [part[skip:] for part in parts], max(0, skip - len(parts[0]))
             stamps.times_s = parts[0][:, 0]
             columns = zip(chain(*tables.values()), chain(*(part.T[1:] for part in parts)), strict=True)
-            found = {name: by_name[name].counts(values) for name, values in columns}
-            yield np.column_stack([found[name] for name in names])
+            counted = {name: by_name[name].counts(values) for name, values in columns}
+            yield np.column_stack([counted[name] for name in names])
 
     def convert(sent: Sent) -> Iterator[np.ndarray]:
         """Yield the counts that a DAQ with these converters records of those sent."""
@@ -105,22 +105,22 @@ def _score_rows(
 
     bits = np.array([recorded[name].lost_bits for name in names])
     coarse = any(scale.rounding for scale in by_name.values())
-    found, trigger, at, repeats = Followed(), None, one.early, list[float]()
-    for places, found in follow(convert(sent), counts(one.early), sound, one.start):  # noqa: B007
-        known = np.flatnonzero(places >= 0)
-        since_s = sent.since_s(places[known]) if len(known) else np.empty(0)
-        stamps.add_rows(sent.first_s, since_s, known, len(places))
-        if arrivals is not None and len(known):
-            came_s = arrivals.since_s(at + known)
+    state, trigger, at, repeats = Followed(), None, one.early, list[float]()
+    for places, state in follow(convert(sent), counts(one.early), sound, one.start):  # noqa: B007
+        placed = np.flatnonzero(places >= 0)
+        since_s = sent.since_s(places[placed]) if len(placed) else np.empty(0)
+        stamps.add_rows(sent.first_s, since_s, placed, len(places))
+        if arrivals is not None and len(placed):
+            came_s = arrivals.since_s(at + placed)
             settled = came_s > _BACKLOG_S
             sent_s = session.arrived_s(groups, sent.first_s + since_s[settled]) - arrivals.unix_s[0]
             delays.times_s = came_s[settled]
             delays.add_rows(0.0, sent_s, np.arange(len(sent_s)), len(sent_s))
             longest_s = max(longest_s, float(np.max(delays.times_s - sent_s, initial=-math.inf)))
-        if trigger is None and session.trigger_s is not None and len(known):
+        if trigger is None and session.trigger_s is not None and len(placed):
             after = np.flatnonzero(sent.first_s + since_s >= session.trigger_s)
             # At row 0 the command may precede the recording: no row is named.
-            trigger = at + int(known[after[0]]) if len(after) and at + known[after[0]] else None
+            trigger = at + int(placed[after[0]]) if len(after) and at + placed[after[0]] else None
         at += len(places)
 
     def add(quantity: str, channel: str, runs: np.ndarray, rows: float | None = None, *, numbered: bool = True) -> None:
@@ -134,8 +134,8 @@ def _score_rows(
 
     if repeats and repeats[0] > _REPEATING_PART:
         card.evidence_gaps.append(f"{table}: the sent rows repeat, so that a loss of whole periods is not visible")
-    add("missing rows", table, found.lost)
-    for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
+    add("missing rows", table, state.lost)
+    for quantity, pairs in (("doubled rows", state.doubled), ("swapped rows", state.swapped)):
         add(quantity, table, stretches(np.unique(pairs[:, 0])), len(pairs))
 
     def hashes() -> Iterator[np.ndarray]:
@@ -143,26 +143,26 @@ def _score_rows(
             row_hashes(each[:, :sound]).view(np.int64) for each in convert(Sent(session, groups, one.step, one.phase))
         )
 
-    foreign, early = found.foreign, one.early
+    foreign, early = state.foreign, one.early
     early += int(np.sum(foreign == np.arange(len(foreign)))) if early else 0  # inexact by some rows if rows are lost
-    after = foreign[(foreign + found.last - found.last_row >= found.sent) & (foreign > found.last_row)]
+    after = foreign[(foreign + state.last - state.last_row >= state.sent) & (foreign > state.last_row)]
     foreign = foreign[early - one.early : len(foreign) - len(after)]
     # Unjudged rows may equal judged ones, for example if the DAQ had recorded the same signal earlier.
     ends = ((early, early, "first", "before"), (len(after), at - len(after), "last", "after"))
     for rows, edge, which, side in (each for each in ends if each[0]):
         card.remarks.append(f"{table}: the {which} {rows} rows are not judged: they are {side} the session's {which}")
-        first, judged = max(0, edge - _EDGE_ROWS), range(found.first, found.last + 1) if which == "first" else range(0)
+        first, judged = max(0, edge - _EDGE_ROWS), range(state.first, state.last + 1) if which == "first" else range(0)
         near = row_hashes(take_rows(counts(first), 0, 2 * _EDGE_ROWS, len(names))[:, :sound]).view(np.int64)
         outside = (np.arange(len(near)) < edge - first) == (which == "first")
         if holds_session_rows(near, outside, judged, hashes):
             card.evidence_gaps.append(f"{table}: unjudged rows {side} the session equal a run of rows in it")
     add("foreign rows", table, stretches(foreign + one.early), numbered=False)
-    for name, altered in zip(names, found.altered, strict=True):
+    for name, altered in zip(names, state.altered, strict=True):
         add("altered values", name, altered.pairs(), altered.rows)
     estimates = {
         "row step": _exact(one.step),
-        "rows before the first": _exact(max(0, found.first)),
-        "rows after the last": _exact(found.sent - 1 - found.last), **stamps.estimate_all(session.wall_s),
+        "rows before the first": _exact(max(0, state.first)),
+        "rows after the last": _exact(state.sent - 1 - state.last), **stamps.estimate_all(session.wall_s),
         "trigger row": None if trigger is None else _exact(trigger),
     }  # fmt: skip
     notes = {}

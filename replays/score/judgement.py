@@ -93,8 +93,8 @@ def judge(
             if 2 * sum(each.scale.known for each in rows.values()) > len(wires):
                 break
     if path is None:
-        known = sum(each.scale.known for each in rows.values())
-        path = "digital" if 2 * known > len(wires) else "analogue"
+        exact = sum(each.scale.known for each in rows.values())
+        path = "digital" if 2 * exact > len(wires) else "analogue"
     if path == "analogue":
         whole = {name: (values, hz) for name in session.channels for values, _, hz in [session.whole(name)]}
         rates = {name: each.rate_hz or rate for name, each in recorded.items()}
@@ -127,7 +127,7 @@ def _missing_evidence(card: Scorecard, due: Sequence[str]) -> list[str]:
     A channel is conclusive by its core quantity: on the digital path its counts, on the analogue path its gain. If that
     quantity has a limit, its whole interval must be inside or outside the limit.
     """
-    core, found = _CORE[card.path], []
+    core, reasons = _CORE[card.path], []
     signals = {str(row.value): row.channel for row in card.rows if row.quantity == "mapping"}
     absent = {row.channel for row in card.rows if row.quantity == "recorded" and row.verdict == FAIL}
     for channel in (name for name in due if name not in absent):
@@ -135,8 +135,8 @@ def _missing_evidence(card: Scorecard, due: Sequence[str]) -> list[str]:
         if not any(row.verdict != INCONCLUSIVE for row in rows):
             notes = (row.note or ("its interval crosses the limit" if row.is_known else "") for row in rows)
             note = next(filter(None, notes), "")
-            found.append(f"{channel}: {core} is inconclusive{': ' if note else ''}{note}")
-    return found
+            reasons.append(f"{channel}: {core} is inconclusive{': ' if note else ''}{note}")
+    return reasons
 
 
 def _snap(rate_hz: float, sent_hz: float) -> float:
@@ -170,19 +170,19 @@ def _connect(
 
 def _name_signals(signals: Sequence[Recorded]) -> dict[str, Recorded]:
     """Return signals by name, with a number after a repeated name."""
-    found: dict[str, Recorded] = {}
+    by_name: dict[str, Recorded] = {}
     for signal in signals:
         name, number = signal.name, 2
-        while name in found:
+        while name in by_name:
             name, number = f"{signal.name} #{number}", number + 1
-        found[name] = signal
-    return found
+        by_name[name] = signal
+    return by_name
 
 
 def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, rows: Mapping[str, SignalRows]) -> None:
     """Add mapping and polarity on the digital path: a signal with a channel's name must be that channel."""
     for name, wire in (wires if card.path == "digital" else {}).items():
-        known = session.channels.keys()
+        channels = session.channels.keys()
         verdict: Verdict = NO_LIMIT
         note = f"correlation {wire.likeness:.4f}"
         scale = rows[name].scale if name in rows else None
@@ -190,7 +190,7 @@ def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, r
         if not wire.channel or not certain:
             verdict = INCONCLUSIVE
             note += f"; equally similar to {', '.join(wire.rivals)}" if wire.rivals else ""
-        elif name in known:
+        elif name in channels:
             verdict = PASS if wire.channel == name else FAIL
         card.rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
         if wire.channel:
@@ -199,8 +199,8 @@ def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, r
             verdict = INCONCLUSIVE if open_ else FAIL if inverted else PASS
             note = "inverted half a period later" if wire.ambiguous and open_ else ""
             card.rows.append(text_row(card.path, "polarity", name, "turned" if inverted else "as sent", verdict, note))
-    taken = [wire.channel for wire in wires.values() if wire.channel]
-    for channel in dict.fromkeys(each for each in taken if taken.count(each) > 1):
+    wired = [wire.channel for wire in wires.values() if wire.channel]
+    for channel in dict.fromkeys(each for each in wired if wired.count(each) > 1):
         names = ", ".join(name for name, wire in wires.items() if wire.channel == channel)
         card.remarks.append(f"{channel} is recorded more than once: {names}")
 
@@ -218,8 +218,8 @@ def _select_channels(session: Session, channels: Sequence[str] | None) -> list[s
         raise InputError("--channels", "names of channels or groups, or omitted for all", "")
     for name in channels:
         if name not in session.channels and name not in session.groups:
-            known = (*session.channels, *session.groups)
-            raise UnknownNameError("--channels", f"channels or groups of {session.path.name}", name, known)
+            names = (*session.channels, *session.groups)
+            raise UnknownNameError("--channels", f"channels or groups of {session.path.name}", name, names)
     return list(dict.fromkeys(each for name in channels for each in session.groups.get(name, (name,))))
 
 
@@ -227,11 +227,11 @@ def _score_recorded(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], due: Sequence[str]
 ) -> None:
     """Add for each channel that was to be recorded whether the file has it, by its name or its values."""
-    found = {wire.channel for wire in wires.values()}
-    found |= {name for name, signal in recorded.items() if np.isfinite(signal.early).any()}
+    present = {wire.channel for wire in wires.values()}
+    present |= {name for name, signal in recorded.items() if np.isfinite(signal.early).any()}
     about = QUANTITIES[card.path]["recorded"]
     for name in due:
-        verdict: Verdict = PASS if name in found else FAIL
+        verdict: Verdict = PASS if name in present else FAIL
         note = "" if verdict == PASS else "not in the file, or not found in it; " + about.run
         value = "yes" if verdict == PASS else "no"
         card.rows.append(ScoreRow("recorded", name, value, 0.0, 0.0, "1", about.method, None, verdict, "", note))

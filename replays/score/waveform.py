@@ -46,7 +46,7 @@ class Waveform:
         middle_s, half_s: Middle of the fitted rows by the clock of the file, and half of their length [s].
         times_s: Times of the fitted rows by the clock of the file [s], shape (n,).
         values: Recorded values [unit], shape (n,).
-        known, slope: The signal and its slope there, without gain [unit, unit/s], shape (n,).
+        sent, slope: The sent signal and its slope there, without gain [unit, unit/s], shape (n,).
         residual: Residual [unit], shape (n,).
     """
 
@@ -61,7 +61,7 @@ class Waveform:
     half_s: float
     times_s: np.ndarray
     values: np.ndarray
-    known: np.ndarray
+    sent: np.ndarray
     slope: np.ndarray
     residual: np.ndarray
 
@@ -190,20 +190,20 @@ class Response:
     corner_hz: tuple[float, float, float] | None
 
 
-def response(found: Waveform) -> Response | None:
+def response(fit: Waveform) -> Response | None:
     """Return the response by Welch's cross spectra; None if the signal has too few frequencies.
 
     Spread: sqrt((1 - coherence) / (2 coherence segments)) (Bendat & Piersol, Random Data, table 9.6). The corner is
     where a parabola through the logarithms near it passes -3 dB.
     """
-    n = len(found.known)
-    rate = (n - 1) / (found.times_s[-1] - found.times_s[0])
+    n = len(fit.sent)
+    rate = (n - 1) / (fit.times_s[-1] - fit.times_s[0])
     length = int(min(2048, n // 16))
-    f, power, gain, coherence = transfer(found.known, found.values, rate, length)
+    f, power, gain, coherence = transfer(fit.sent, fit.values, rate, length)
     shown = (coherence > _MIN_COHERENCE) & (power > 1e-5 * power.max()) & (f > 0.0)
     if shown.sum() < 16:
         return None
-    f, gain, coherence = f[shown], gain[shown] / abs(found.gain), coherence[shown]
+    f, gain, coherence = f[shown], gain[shown] / abs(fit.gain), coherence[shown]
     segments = 2.0 * n / length * 0.9
     spread = np.sqrt((1.0 - coherence) / (2.0 * coherence * segments)) + 1e-9
     lowest = f <= max(f[7], 0.1 * f[-1])
@@ -227,8 +227,8 @@ def _find_corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[fl
     x, weights = np.log(f[near] / at), 1.0 / spread[near]
     matrix = np.vander(x, 3) * weights[:, None]
     parts = solve(matrix, weights * log[near])
-    left = weights * log[near] - matrix @ parts
-    inverse = inverse_square(matrix) * max(1.0, float(left @ left) / (len(x) - 3))
+    residual = weights * log[near] - matrix @ parts
+    inverse = inverse_square(matrix) * max(1.0, float(residual @ residual) / (len(x) - 3))
     roots = [r.real for r in np.roots(parts - [0.0, 0.0, level]) if abs(r.imag) < 1e-9]
     if not roots:
         return None
@@ -246,27 +246,27 @@ def _number_rows(times_s: np.ndarray) -> tuple[np.ndarray, float]:
     return places, (times_s[-1] - times_s[0]) / max(1, int(places[-1]))
 
 
-def fit_linear_response(found: Waveform) -> Waveform:
+def fit_linear_response(fit: Waveform) -> Waveform:
     """Return the fit with the linear response of the channel, 96 taps by least squares, whose residual is noise."""
     from scipy.linalg import solve_toeplitz
     from scipy.signal import correlate
 
-    x = found.known - found.known.mean()
-    y = found.values - found.values.mean()
+    x = fit.sent - fit.sent.mean()
+    y = fit.values - fit.values.mean()
     n, half = len(x), _TAPS // 2
     auto = correlate(x, x, method="fft")[n - 1 :][:_TAPS]
     cross = correlate(y, x, method="fft")[n - 1 - half :][:_TAPS]
     auto[0] *= 1.0 + 1e-9
     taps = np.asarray(solve_toeplitz(auto, cross))
-    known = np.convolve(x, taps)[half : half + n]
-    slope = np.convolve(found.slope, taps)[half : half + n]
-    places, _ = _number_rows(found.times_s)
+    sent = np.convolve(x, taps)[half : half + n]
+    slope = np.convolve(fit.slope, taps)[half : half + n]
+    places, _ = _number_rows(fit.times_s)
     kept = np.zeros(n, bool)  # rows whose taps include no lost sample
     kept[_TAPS:-_TAPS] = places[_TAPS + half : n - half] - places[half : n - _TAPS - half] == _TAPS
-    left = (y - known)[kept]
+    residual = (y - sent)[kept]
     return replace(
-        found, gain=1.0, times_s=found.times_s[kept], values=y[kept], known=known[kept], slope=slope[kept],
-        residual=left - left.mean(),
+        fit, gain=1.0, times_s=fit.times_s[kept], values=y[kept], sent=sent[kept], slope=slope[kept],
+        residual=residual - residual.mean(),
     )  # fmt: skip
 
 
@@ -276,25 +276,25 @@ def find_order(shown: Response) -> int:
     log, weights = np.log(shown.gain), np.maximum(shown.spread, 0.01) ** -2.0
     # The corner has an error, which is larger for an incorrect order.
     ratios = shown.frequency_hz[:, None] / (shown.corner_hz[0] * np.linspace(0.9, 1.1, 41))
-    left = [np.min(weights @ (log[:, None] + 0.5 * np.log1p(ratios ** (2 * n))) ** 2) for n in range(1, _ORDERS + 1)]
-    return int(np.argmin(left)) + 1
+    costs = [np.min(weights @ (log[:, None] + 0.5 * np.log1p(ratios ** (2 * n))) ** 2) for n in range(1, _ORDERS + 1)]
+    return int(np.argmin(costs)) + 1
 
 
 Corner = tuple[float, float, float]
 
 
-def fit_with_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple[Waveform, Corner] | None:
+def fit_with_filter(start: Waveform, stimulus: Stimulus, shown: Response) -> tuple[Waveform, Corner] | None:
     """Return the fit with a Butterworth low-pass between signal and record, and its corner with interval, or None.
 
     Gain is that at low frequencies, and time is without the filter's delay. None if no corner fits.
 
     Args:
-        found: The fit without the filter.
+        start: The fit without the filter.
         stimulus: The known signal.
         shown: The response by that fit, with a corner.
     """
     assert shown.corner_hz is not None
-    order, corner_hz, near, late_s = find_order(shown), shown.corner_hz[0], found, None
+    order, corner_hz, near, late_s = find_order(shown), shown.corner_hz[0], start, None
     better = None
     for _ in range(_PASSES):
         better = _fit_filter(near, stimulus, corner_hz, order, late_s)
@@ -302,8 +302,8 @@ def fit_with_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tup
             return None
         # Repeat with the signal at the updated times.
         fit, (corner_hz, _, _) = better
-        known, slope = stimulus(found.times_s + fit.late_at(found.times_s))
-        near, late_s = replace(fit, times_s=found.times_s, values=found.values, known=known, slope=slope), 0.0
+        sent, slope = stimulus(start.times_s + fit.late_at(start.times_s))
+        near, late_s = replace(fit, times_s=start.times_s, values=start.values, sent=sent, slope=slope), 0.0
     assert better is not None
     fit, (corner_hz, low, high) = better
     true = 1.0 / (1.0 + fit.drift)  # converts seconds of the file to those of the session
@@ -311,11 +311,11 @@ def fit_with_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tup
 
 
 def _fit_filter(
-    found: Waveform, stimulus: Stimulus, corner_hz: float, order: int, late_s: float | None
+    start: Waveform, stimulus: Stimulus, corner_hz: float, order: int, late_s: float | None
 ) -> tuple[Waveform, Corner] | None:
     """Return the fit from an initial corner and delay; by default the filter's delay at low frequencies."""
-    span_s = found.times_s[-1] - found.times_s[0]
-    places, step_s = _number_rows(found.times_s)
+    span_s = start.times_s[-1] - start.times_s[0]
+    places, step_s = _number_rows(start.times_s)
     n = int(places[-1]) + 1
     # The filter's delay at low frequencies, by default.
     delay_s = 1.0 / (2.0 * math.pi * corner_hz * math.sin(math.pi / (2.0 * order))) if late_s is None else late_s
@@ -324,11 +324,11 @@ def _fit_filter(
     kept = slice(*np.searchsorted(places, (cut, n - cut)))
     if n < 8 * cut + _MIN_SAMPLES or kept.stop - kept.start < _MIN_SAMPLES:
         return None
-    y, known, slope = found.values, found.known, found.slope
+    y, sent, slope = start.values, start.sent, start.slope
     if n > len(places):  # the filter also needs the instants of lost samples
-        even_s = found.times_s[0] + step_s * np.arange(n)
-        known, slope = stimulus(even_s + found.late_at(even_s))
-    spectra = [Spectrum.from_samples(values, step_s) for values in (known, slope)]
+        even_s = start.times_s[0] + step_s * np.arange(n)
+        sent, slope = stimulus(even_s + start.late_at(even_s))
+    spectra = [Spectrum.from_samples(values, step_s) for values in (sent, slope)]
     poles = np.exp(1j * np.pi * (2.0 * np.arange(1, order + 1) + order - 1.0) / (2.0 * order))
     log = math.log(corner_hz)
 
@@ -337,7 +337,7 @@ def _fit_filter(
         loss = np.prod([1.0 - s / pole for pole in poles], axis=0)
         return spectrum.apply_response(np.exp(spectrum.turn * delay_s) / loss)[places[kept]]
 
-    u = (2.0 * (found.times_s - found.middle_s) / span_s)[kept]
+    u = (2.0 * (start.times_s - start.middle_s) / span_s)[kept]
     ones = np.ones(len(u))
     solved = None
     for _ in range(2 * _MAX_STEPS):
@@ -361,8 +361,8 @@ def _fit_filter(
     covariance = covariance / np.outer(units, units)
     half = float(student(dof[5])) * math.sqrt(covariance[5, 5])
     fitted = Waveform(
-        float(parts[0]), float(parts[1]), found.late_s + float(delay_s),
-        found.drift + float(parts[3]) / (0.5 * span_s), found.bend + float(parts[4]) / (0.125 * span_s**2),
-        covariance[:5, :5], dof[:5], found.middle_s, found.half_s, found.times_s[kept], y[kept], s, ds, residual,
+        float(parts[0]), float(parts[1]), start.late_s + float(delay_s),
+        start.drift + float(parts[3]) / (0.5 * span_s), start.bend + float(parts[4]) / (0.125 * span_s**2),
+        covariance[:5, :5], dof[:5], start.middle_s, start.half_s, start.times_s[kept], y[kept], s, ds, residual,
     )  # fmt: skip
     return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))

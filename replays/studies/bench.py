@@ -234,9 +234,9 @@ def _run(scene: Scene, case: BenchCase) -> tuple[float, np.ndarray, Simulation]:
 
 def _reference(problem: Problem) -> tuple[np.ndarray, float | None, str]:
     """Return states at every 1 ms, the distance between the two codes of the reference, and their names."""
-    found = find_reference(problem, quick=True)
-    if found is not None:
-        return found.solution.states, found.error, " and ".join(found.names)
+    reference = find_reference(problem, quick=True)
+    if reference is not None:
+        return reference.solution.states, reference.error, " and ".join(reference.names)
     rk8 = {"engine.tolerance": 1e-13}
     scene = load_scene("hammer", {**_engine("rk8", 5, **rk8), "duration_s": problem.duration_s})
     rows = _run(scene, BenchCase("reference", "hammer"))[1]
@@ -247,15 +247,15 @@ def _cheapest(
     name: str, wanted: float, problem: Problem, reference: np.ndarray
 ) -> list[tuple[str, float, Setting, float]]:
     """Return the fastest setting of a peer's refined ladder whose error is at most the given one, if any."""
-    found: tuple[float, Setting, float] | None = None
+    best: tuple[float, Setting, float] | None = None
     for setting in _refine_ladder(PEERS[name].ladder):
         solution = PEERS[name].solve(problem, setting, budget_s=30.0)
         if solution.failure is not None:
             continue
         error = scaled_error(solution.states, reference[: len(solution.states)])
-        if error <= wanted and (found is None or solution.cpu_s < found[0]):
-            found = (solution.cpu_s, setting, error)
-    return [] if found is None else [(name, wanted, found[1], found[2])]
+        if error <= wanted and (best is None or solution.cpu_s < best[0]):
+            best = (solution.cpu_s, setting, error)
+    return [] if best is None else [(name, wanted, best[1], best[2])]
 
 
 def _refine_ladder(ladder: tuple[Setting, ...]) -> list[Setting]:

@@ -348,7 +348,7 @@ def test_deliberate_corrections_are_not_reported_as_differences(report: Report):
 
 
 def test_ringing_houses_are_drawn_as_waves(findings: Findings):
-    one = findings.found["corrected"]
+    one = findings.runs_by_set["corrected"]
     start, end = first_impacts(one.drop["penetration"], one.drop.times_s * 1e3)
     touching = one.drop.times_s[one.drop["penetration"] > 0.0] * 1e3
     assert start < touching[0] < end

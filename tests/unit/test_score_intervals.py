@@ -43,7 +43,7 @@ def _fit(noise: float, jitter_s: float, generator: np.random.Generator, n: int =
     residual = noise * generator.standard_normal(n) + jitter_s * slope * generator.standard_normal(n)
     return Waveform(
         gain=1.0, offset=0.0, late_s=0.0, drift=0.0, bend=0.0, covariance=np.eye(5), dof=np.ones(5), middle_s=0.0,
-        half_s=0.5 * n / 20e3, times_s=times_s, values=residual, known=slope / 6283.0, slope=slope, residual=residual,
+        half_s=0.5 * n / 20e3, times_s=times_s, values=residual, sent=slope / 6283.0, slope=slope, residual=residual,
     )  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def _two_levels(gain: float, noise: float) -> Waveform:
     known = np.where(np.arange(len(fit.values)) // 37 % 2, 205.0, -205.0)
     covariance = np.diag([1e-12, 1e-6, 1e-18, 1e-18, 1e-18])
     return replace(
-        fit, gain=gain, known=known, values=gain * known + fit.residual, slope=0.0 * known + 1.0,
+        fit, gain=gain, sent=known, values=gain * known + fit.residual, slope=0.0 * known + 1.0,
         covariance=covariance, dof=np.full(5, 1e4),
     )  # fmt: skip
 
@@ -61,14 +61,14 @@ def _two_levels(gain: float, noise: float) -> Waveform:
 def test_two_levels_rounded_by_the_session_leave_the_gain_inconclusive() -> None:
     # 204.8 counts, rounded to 205 with noise of a tenth of a step: off by 976 ppm, and by up to 0.4 / 205 from others.
     fit = _two_levels(204.8 / 205.0, 0.1)
-    session = Converter(1.0, 0.1, values=fit.known)
+    session = Converter(1.0, 0.1, values=fit.sent)
     half = widen_intervals(fit, find_undithered(fit, 0.0, session)).half_widths[0]
     assert 976e-6 < half < 0.5 / 205.0
 
 
 def test_noise_of_one_step_removes_the_rounding_error() -> None:
     fit = _two_levels(1.0, 1.0)
-    assert find_undithered(fit, 1.0, Converter(1.0, 1.0, values=fit.known)) == ()
+    assert find_undithered(fit, 1.0, Converter(1.0, 1.0, values=fit.sent)) == ()
     assert widen_intervals(fit, ()) is fit
 
 
@@ -76,7 +76,7 @@ def test_intervals_of_noise_and_jitter_are_two_standard_deviations_to_each_side(
     # The spread of an rms is rms / sqrt(2 n); that of jitter is measured over the fits themselves.
     generator = np.random.default_rng(2)
     splits = [split_noise(_fit(1e-3, 2e-7, generator)) for _ in range(40)]
-    alone = [split_noise(_fit(1e-3, 0.0, generator)).left for _ in range(12)]
+    alone = [split_noise(_fit(1e-3, 0.0, generator)).total for _ in range(12)]
     widths = np.mean([high - low for _, low, high in alone])
     assert widths == pytest.approx(2.0 * 1.96 * 1e-3 / math.sqrt(2.0 * 6400), rel=0.08)
     jitters = [split.jitter_s for split in splits if split.jitter_s is not None]
@@ -90,7 +90,7 @@ def test_a_floor_is_subtracted_from_the_low_end_of_the_noise_only() -> None:
     found, generator = [], np.random.default_rng(3)
     fit = _fit(1e-3, 0.0, generator)
     for floor in (0.0, 0.6e-3):
-        found.append(split_noise(fit, floor=floor).left)
+        found.append(split_noise(fit, floor=floor).total)
     (value, low, high), (same, lower, still) = found
     assert (value, high) == (same, still)
     assert lower == pytest.approx(math.sqrt(low**2 - 0.36e-6))

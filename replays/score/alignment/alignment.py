@@ -46,30 +46,30 @@ def align(sources: Sequence[RowSource]) -> Alignment | None:
     candidates.follow_candidates([0.0, *(each - one.wire.offset_s for each in one.wire.others_s)])
     for _ in range(_MAX_SEARCHES):
         candidates.follow_candidates(candidates.find_shifts())
-    alike, found = _follow_best(candidates, sources)
-    if found and all(each.track.steps() for each in found):
+    alike, alignments = _follow_best(candidates, sources)
+    if alignments and all(each.track.steps() for each in alignments):
         candidates.search_more_signals()
-        alike, found = _follow_best(candidates, sources)
-    if not found:
+        alike, alignments = _follow_best(candidates, sources)
+    if not alignments:
         return follow(sources, 0.0, default)
-    most = max(each.balance for each in found)
-    left = [_log_residual_power(each, sources) if found[1:] else 0.0 for each in found]
+    most = max(each.balance for each in alignments)
+    powers = [_log_residual_power(each, sources) if alignments[1:] else 0.0 for each in alignments]
 
     def rank(n: int) -> tuple[bool, bool, int, bool, int, float]:
-        each, alike_in_all = found[n], left[n] <= min(left) + _EQUAL_LOG_POWER
-        contradicted = any(left[m] < left[n] and _contradicts(other, each) for m, other in enumerate(found))
+        each, alike_in_all = alignments[n], powers[n] <= min(powers) + _EQUAL_LOG_POWER
+        contradicted = any(powers[m] < powers[n] and _contradicts(other, each) for m, other in enumerate(alignments))
         balanced = each.balance > EQUAL_BALANCE_PART * most
         return not contradicted, balanced, -candidates.penalty(each), alike_in_all, each.upright, -abs(each.shift_s)
 
-    best = found[max(range(len(found)), key=rank)]
+    best = alignments[max(range(len(alignments)), key=rank)]
     steps = len(best.track.steps())
     if best.whole and not best.upright:
         # Half a period later the signal is inverted: more rows in the session do not justify an inverted record.
         upright = [
-            n for n, each in enumerate(found) if each.upright and each.whole and len(each.track.steps()) == steps
+            n for n, each in enumerate(alignments) if each.upright and each.whole and len(each.track.steps()) == steps
         ]
-        best = found[max(upright, key=rank)] if upright else best
-    doubted = any(each.track.explained > best.track.explained and _contradicts(best, each) for each in found)
+        best = alignments[max(upright, key=rank)] if upright else best
+    doubted = any(each.track.explained > best.track.explained and _contradicts(best, each) for each in alignments)
     return replace(trim_quiet_ends(best, one), ambiguous=len(alike) > 1, steps_doubted=doubted)
 
 
@@ -80,33 +80,33 @@ def _follow_best(candidates: Candidates, sources: Sequence[RowSource]) -> tuple[
     return alike, [each for s in shifts_s if (each := follow(sources, s, candidates.stretches(s)))]
 
 
-def _contradicts(other: Alignment, found: Alignment) -> bool:
+def _contradicts(other: Alignment, alignment: Alignment) -> bool:
     """Return whether an alignment explains the rows about another one's step without a step.
 
     A lost sample is a step from every start. Where a signal nearly repeats, an incorrect start may need steps in place
     of the difference, and with these explain rows after the session's end.
     """
     return any(
-        run.start <= max(0, first - MIN_ROWS) and min(found.rows, last + MIN_ROWS) <= run.end
-        for first, last, _ in found.track.steps()
+        run.start <= max(0, first - MIN_ROWS) and min(alignment.rows, last + MIN_ROWS) <= run.end
+        for first, last, _ in alignment.track.steps()
         for run in other.track.runs
     )
 
 
-def _log_residual_power(found: Alignment, sources: Sequence[RowSource]) -> float:
+def _log_residual_power(alignment: Alignment, sources: Sequence[RowSource]) -> float:
     """Return the logarithm of the residual part of each signal's power from a common start, summed over the signals.
 
     Each signal matches a repeated start at a slightly different time, as a keyphasor does whose pulses occur at another
     angle of the whirl.
     """
-    common_s, total = float(np.median(list(found.own_s.values()))), 0.0
+    common_s, total = float(np.median(list(alignment.own_s.values()))), 0.0
     for one in sources:
-        values, times_s, (late_s, pace, bend) = found.even(one)
+        values, times_s, (late_s, pace, bend) = alignment.even(one)
         since_s = times_s - 0.5 * (times_s[0] + times_s[-1])
-        own_s = found.own_s.get(one.name, one.offset_s + found.shift_s)
+        own_s = alignment.own_s.get(one.name, one.offset_s + alignment.shift_s)
         at_s = times_s + late_s - own_s + common_s + since_s * (pace + bend * since_s)
         held = np.isfinite(values) & (at_s >= one.stimulus.span_s[0]) & (at_s <= one.stimulus.span_s[1])
-        known = one.stimulus(at_s[held])[0]
-        if np.std(known) and np.std(values[held]):
-            total += math.log(max(1e-12, 1.0 - float(np.corrcoef(known, values[held])[0, 1]) ** 2))
+        sent = one.stimulus(at_s[held])[0]
+        if np.std(sent) and np.std(values[held]):
+            total += math.log(max(1e-12, 1.0 - float(np.corrcoef(sent, values[held])[0, 1]) ** 2))
     return total

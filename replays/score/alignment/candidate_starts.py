@@ -82,33 +82,34 @@ class Candidates:
 
     def _measure_residuals(self, shift_s: float) -> np.ndarray:
         """Return the residual power of stretches from a start, nan for unexplained ones, shape (signals, n)."""
-        found = np.full((min(_MAX_SEARCHED, len(self._compared)), len(self._parts)), np.nan)
-        for n, part in np.ndindex(found.shape):
+        powers = np.full((min(_MAX_SEARCHED, len(self._compared)), len(self._parts)), np.nan)
+        for n, part in np.ndindex(powers.shape):
             one = self._compared[n]
             fit = fit_stretch(one.values, one.times_s, one.stimulus, one.offset_s + shift_s, self._parts[part])
             if fit is not None:
-                found[n, part] = max(float(np.var(fit.residual)), 1e-300)
-        return found
+                powers[n, part] = max(float(np.var(fit.residual)), 1e-300)
+        return powers
 
-    def _residual_power(self, found: Alignment, one: RowSource) -> np.ndarray:
+    def _residual_power(self, alignment: Alignment, one: RowSource) -> np.ndarray:
         """Return the residual power of blocks over that of noise; their whole power where unexplained, nan outside."""
-        values, times_s, curve = found.even(one)
+        values, times_s, curve = alignment.even(one)
         fit = fit_waveform(values, times_s, one.stimulus, curve)
         if fit is not None and (odd := _find_outliers(fit)).any():
             # Without these rows, as a fault of a few rows would raise the residual of all blocks.
             values[np.rint((fit.times_s[odd] - times_s[0]) * one.rate_hz).astype(int)] = np.nan
             fit = fit_waveform(values, times_s, one.stimulus, curve)
-        left = np.full(found.rows, np.nan)
-        left[slice(*found.track.inside)] = np.nanvar(one.values)
+        squares = np.full(alignment.rows, np.nan)
+        squares[slice(*alignment.track.inside)] = np.nanvar(one.values)
         if fit is not None:
-            left[found.rows_at(fit.times_s)] = fit.residual**2
+            squares[alignment.rows_at(fit.times_s)] = fit.residual**2
         power = _block_means((one.values - np.nanmean(one.values)) ** 2)
         # Noise of the DAQ, and of the session if its samples are the known signal.
         sources = 1.0 if isinstance(one.stimulus, Exact) else 2.0
         noise = (
             _NOISES * math.hypot(one.channel.noise_v, one.channel.lsb_v / math.sqrt(12.0)) / one.channel.sensitivity_v
         )
-        return np.where(power > _MIN_POWER_PART * np.nanmean(power), _block_means(left), np.nan) / (sources * noise**2)
+        loud = power > _MIN_POWER_PART * np.nanmean(power)
+        return np.where(loud, _block_means(squares), np.nan) / (sources * noise**2)
 
     def _exceeds(self, power: np.ndarray, other: np.ndarray) -> bool:
         """Return whether a start has a higher residual than another, by the median blocks that both explain."""
@@ -159,20 +160,20 @@ class Candidates:
         self._searched, self._least_power = self._compared, math.inf
         self.follow_candidates(self.find_shifts())
 
-    def count_outside(self, found: Alignment) -> int:
+    def count_outside(self, alignment: Alignment) -> int:
         """Return the number of rows outside the session, from a start, that are as loud as those in it."""
-        first, last = found.track.inside
+        first, last = alignment.track.inside
         loud = _MIN_POWER_PART * float(np.nanvar(self._one.values[first:last]))
         parts = [self._one.values[self._busy[0] : first], self._one.values[last : self._busy[1]]]
         return sum(len(part) for part in parts if len(part) >= _EDGE_ROWS and np.nanvar(part) >= loud)
 
-    def penalty(self, found: Alignment) -> int:
+    def penalty(self, alignment: Alignment) -> int:
         """Return the number of stretches of rows that are loud and outside the session, or in it and unexplained.
 
         A sample lost near an end must not place rows outside the session.
         """
-        inside = found.track.inside[1] - found.track.inside[0]
-        return (self.count_outside(found) + inside - found.track.explained) // _EDGE_ROWS
+        inside = alignment.track.inside[1] - alignment.track.inside[0]
+        return (self.count_outside(alignment) + inside - alignment.track.explained) // _EDGE_ROWS
 
     def find_shifts(self) -> list[float]:
         """Return shifts at which the known signal repeats [s], by all rows and by those that the best start explains.
@@ -206,8 +207,8 @@ class Candidates:
 
     def stretches(self, shift_s: float) -> list[tuple[int, int]]:
         """Return the stretches by which a start is followed; the last one is that with the least residual."""
-        left = self._residuals[self._shifts.index(shift_s)][0]
-        best = [] if np.isnan(left).all() else [self._parts[int(np.nanargmin(left))]]
+        powers = self._residuals[self._shifts.index(shift_s)][0]
+        best = [] if np.isnan(powers).all() else [self._parts[int(np.nanargmin(powers))]]
         return [*self._default(shift_s), *best]
 
     def _rows_inside(self, shift_s: float) -> int:
@@ -247,13 +248,13 @@ class Candidates:
                 return
             self._followed_numbers.add(n)
             shift_s = self._shifts[n]
-            found = follow([one], shift_s, self.stretches(shift_s))
-            own_s = found.own_s[one.name] if found else 0.0
+            alignment = follow([one], shift_s, self.stretches(shift_s))
+            own_s = alignment.own_s[one.name] if alignment else 0.0
             near = [abs(own_s - each.own_s[one.name]) * one.rate_hz for _, each in self._fits]
-            if found is not None and min(near, default=math.inf) > _SAME_ROWS:
-                power = np.array([self._residual_power(found, each) for each in self._compared])
+            if alignment is not None and min(near, default=math.inf) > _SAME_ROWS:
+                power = np.array([self._residual_power(alignment, each) for each in self._compared])
                 if np.isfinite(power).any():
-                    self._fits.append((power, found))
+                    self._fits.append((power, alignment))
                     self._least_power = min(self._least_power, float(np.nanmax(_medians(power))))
 
 
@@ -280,14 +281,14 @@ def _find_outliers(fit: Waveform) -> np.ndarray:
     return odd if odd.mean() < _MAX_OUTLIER_PART else np.zeros(len(odd), bool)
 
 
-def trim_quiet_ends(found: Alignment, one: RowSource) -> Alignment:
+def trim_quiet_ends(alignment: Alignment, one: RowSource) -> Alignment:
     """Return an alignment without quiet rows at the ends of the session, when the DAQ was not connected yet."""
-    values, times_s, curve = found.even(one)
+    values, times_s, curve = alignment.even(one)
     fit = fit_waveform(values, times_s, one.stimulus, curve)
     if fit is None:
-        return found
-    odd = found.rows_at(fit.times_s[_find_outliers(fit)])
-    runs, (first, last) = list(found.track.runs), found.track.inside
+        return alignment
+    odd = alignment.rows_at(fit.times_s[_find_outliers(fit)])
+    runs, (first, last) = list(alignment.track.runs), alignment.track.inside
     loud = _MIN_POWER_PART * float(np.nanvar(one.values[first:last]))
     start = int(odd[odd < runs[0].start + _BLOCK_ROWS].max(initial=runs[0].start - 1)) + 1
     if runs[0].start < start < runs[0].end and np.nanvar(one.values[runs[0].start : start]) < loud:
@@ -295,7 +296,7 @@ def trim_quiet_ends(found: Alignment, one: RowSource) -> Alignment:
     end = int(odd[odd >= runs[-1].end - _BLOCK_ROWS].min(initial=runs[-1].end))
     if runs[-1].start < end < runs[-1].end and np.nanvar(one.values[end : runs[-1].end]) < loud:
         last, runs[-1] = end, replace(runs[-1], end=end)
-    return replace(found, track=replace(found.track, runs=runs, inside=(first, last)))
+    return replace(alignment, track=replace(alignment.track, runs=runs, inside=(first, last)))
 
 
 def _medians(power: np.ndarray) -> np.ndarray:

@@ -110,6 +110,6 @@ def _hash_groups(pieces: Iterable[np.ndarray], step: int, every: np.uint64) -> I
         for n in range(0, reach + 1, step):
             hashes = hashes * np.uint64(0x9E3779B97F4A7C15) + single[n : n + size]
             moving |= single[n : n + size] != single[:size]
-        taken = np.flatnonzero(moving & ((hashes >> np.uint64(20)) % every == 0))
-        yield hashes[taken], at + taken
+        chosen = np.flatnonzero(moving & ((hashes >> np.uint64(20)) % every == 0))
+        yield hashes[chosen], at + chosen
         held, at = held[size:], at + size

@@ -19,7 +19,7 @@ _MIN_LIKENESS = 0.5
 """Part of its power that the known signal must explain in a matching record."""
 
 
-def find_repeats(values: np.ndarray, first_s: float, found: Waveform, stimulus: Stimulus) -> list[float]:
+def find_repeats(values: np.ndarray, first_s: float, fit: Waveform, stimulus: Stimulus) -> list[float]:
     """Return session less file times at which the known signal matches a record, by the clock of a fit [s].
 
     Record and session need only overlap in part. Times whose residual equals the best one are first, in order of their
@@ -28,15 +28,15 @@ def find_repeats(values: np.ndarray, first_s: float, found: Waveform, stimulus: 
     Args:
         values: Values of the record, shape (n,).
         first_s: Time of the first value by the record's clock [s].
-        found: A fit of some of the values.
+        fit: A fit of some of the values.
         stimulus: The known signal.
     """
     from scipy.signal import correlate
 
     low, high = stimulus.span_s
-    period_s = (found.times_s[-1] - found.times_s[0]) / (len(found.times_s) - 1)
-    step_s = (1.0 + found.drift) * period_s
-    skipped = max(0, min(round((found.times_s[0] - first_s) / period_s), len(values) - _SAMPLES // 2) - _SAMPLES // 2)
+    period_s = (fit.times_s[-1] - fit.times_s[0]) / (len(fit.times_s) - 1)
+    step_s = (1.0 + fit.drift) * period_s
+    skipped = max(0, min(round((fit.times_s[0] - first_s) / period_s), len(values) - _SAMPLES // 2) - _SAMPLES // 2)
     y = values[skipped : skipped + _SAMPLES] - values.mean()
     n, rows = len(y), math.floor((high - low) / step_s)
     lags = np.arange(1 - n, rows - 1)
@@ -66,9 +66,9 @@ def find_repeats(values: np.ndarray, first_s: float, found: Waveform, stimulus: 
     aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
     peaks = np.minimum(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside, 1.0)
     # The error of a parabola at its peak is some part of the square of its bend.
-    left = (1.0 - peaks) * (power_y / overlap)[at // _FACTOR]
-    alike = left <= _RATIO * left.min(initial=math.inf) + 0.1 * bend**2 * (power_y / overlap)[at // _FACTOR]
-    best = np.lexsort((np.where(alike, -overlap[at // _FACTOR], left), ~alike))[:_MAX_TIMES]
+    residual = (1.0 - peaks) * (power_y / overlap)[at // _FACTOR]
+    alike = residual <= _RATIO * residual.min(initial=math.inf) + 0.1 * bend**2 * (power_y / overlap)[at // _FACTOR]
+    best = np.lexsort((np.where(alike, -overlap[at // _FACTOR], residual), ~alike))[:_MAX_TIMES]
     # Session less file time in the middle of the overlap, as the clocks differ.
     middle = (here + 0.5 * overlap)[at[best] // _FACTOR]
     place = middle + lags[valid][0] + (at[best] + aside[best]) / _FACTOR

@@ -88,7 +88,7 @@ class _Search:
         start = max(0, offset - (phase - index) % step) // step
         return SignalRows(scale, step, phase, max(0, -(offset // step)), start, offset)
 
-    def is_better(self, offset: int, other: int, signals: Iterable[tuple[str, str, Scale]], *, known: bool) -> bool:
+    def is_better(self, offset: int, other: int, signals: Iterable[tuple[str, str, Scale]], *, shared: bool) -> bool:
         """Return whether all rows in the session are equal from a start, but not from another one.
 
         For a nearly repeating signal, other starts have more rows in the session, nearly all of which are equal. The
@@ -98,7 +98,7 @@ class _Search:
             offset: Place of the first row in the session, or negative.
             other: Another such place.
             signals: Signals of one table: name, channel and scale.
-            known: Whether another table of the file has this start. If so, any unequal row from the other one counts;
+            shared: Whether another table of the file has this start. If so, any unequal row from the other one counts;
                 if not, only those that are in the session from both.
         """
         moving, unequal, expected = 0, 0, 0.0
@@ -108,7 +108,7 @@ class _Search:
                 return False
             wrong, step = ~self.compare(name, of, other, scale)[2], self.find_step(name, of)
             first = max(0, -(offset // step)) - max(0, -(other // step))
-            both = wrong if known else wrong[max(0, first) : max(0, first + len(same))]
+            both = wrong if shared else wrong[max(0, first) : max(0, first + len(same))]
             moving, unequal = moving + longest, unequal + int(both.sum())
             expected += len(both) * float(wrong.mean()) if len(wrong) else 0.0
         return moving >= _MIN_MOVING and 0 < unequal <= _MAX_UNEQUAL + 1.5 * expected
@@ -134,13 +134,13 @@ class _Search:
         _, counts = self.held[channel.group]
         offsets_s = self._wires[name].offset_s, self._wires[name].own_s
         late = [round(each * self._session.rate_hz(channel.group)) for each in offsets_s]
-        placed, most = list[tuple[bool, int, int, Scale]](), list[bool]()
+        candidates, most = list[tuple[bool, int, int, Scale]](), list[bool]()
 
         def try_offset(offset: int) -> bool:
             values, unit, there, _ = self.select_rows_from(name, of, offset)
             if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
                 longest, part, _ = self.compare(name, of, offset, scale)
-                placed.append((scale.clean, longest, offset, scale))
+                candidates.append((scale.clean, longest, offset, scale))
                 most.append(scale.clean and part > _MIN_EQUAL_PART)
                 return scale.clean and part == 1.0
             return False
@@ -150,14 +150,14 @@ class _Search:
             early, bits = signal.early[:_MAX_SCALE_ROWS], signal.lost_bits
             there = counts[:, self._session.place(of)] >> bits << bits
             likely = self._find_overlaps(name, of, step) if not any(most) else []
-            fewest, known = min(len(early), len(there) // step), scales(signal.unit, channel, signal.early, there)
-            found = (find_starts([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
-            any(map(try_offset, likely or next((places for places in found if places), [])))
-        if not placed:
+            fewest, options = min(len(early), len(there) // step), scales(signal.unit, channel, signal.early, there)
+            matches = (find_starts([each.counts(early)], [each.sent(there)], step, fewest) for each in options)
+            any(map(try_offset, likely or next((places for places in matches if places), [])))
+        if not candidates:
             return None
-        *_, offset, scale = max(placed, key=lambda each: each[:2])
-        for _, _, other, its in placed:
-            if its.clean and self.is_better(other, offset, [(name, of, its)], known=False):
+        *_, offset, scale = max(candidates, key=lambda each: each[:2])
+        for _, _, other, its in candidates:
+            if its.clean and self.is_better(other, offset, [(name, of, its)], shared=False):
                 offset, scale = other, its
         self.offsets.setdefault(table, offset)
         return self.make_rows(scale, step, offset, channel.group)
@@ -165,12 +165,12 @@ class _Search:
     def _find_overlaps(self, name: str, of: str, step: int) -> list[int]:
         """Return candidate starts of the table by all rows of both, for a few signals, as each reads both files."""
         signal, channel = self._recorded[name], self._session.channels[of]
-        sent, asked = Sent(self._session, [channel.group]), self._searched.setdefault(id(signal.table), set())
+        sent, searched = Sent(self._session, [channel.group]), self._searched.setdefault(id(signal.table), set())
         rows = self._session.rows(channel.group)
         beyond = signal.rows > _MAX_SCALE_ROWS or rows > len(self.held[channel.group][1])
-        if not beyond or name in asked or len(asked) >= _MAX_SEARCHES:
+        if not beyond or name in searched or len(searched) >= _MAX_SEARCHES:
             return []
-        asked.add(name)
+        searched.add(name)
         column, fewest = sent.names.index(of), min(signal.rows, rows // step)
         some = [_decimate(part[:, 1]) for part in signal.table.parts([signal.column])]
         bits = signal.lost_bits
@@ -193,8 +193,8 @@ def identify_signals(
     Returns:
         Wires and rows, by the signals' names in the file.
     """
-    search, rows, found = _Search(recorded, wires, session), dict[str, SignalRows](), dict(wires)
-    asked = list[str]()
+    search, rows, wired = _Search(recorded, wires, session), dict[str, SignalRows](), dict(wires)
+    searched = list[str]()
 
     def identify(name: str, likely: Iterable[str]) -> None:
         # Counts are certain where stamps, by which signals are correlated, are not: those of a rig in lockstep.
@@ -205,7 +205,7 @@ def identify_signals(
             longest, part, _ = search.compare(name, of, one.offset, one.scale)
             if longest > best or part == 1.0:
                 best, rows[name] = longest, one
-                found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
+                wired[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
             if part == 1.0:
                 break
 
@@ -213,8 +213,8 @@ def identify_signals(
         identify(name, (wire.channel, name, *wire.rivals))
     # In a whirl, a signal correlates equally well with channels that lag its own by a quarter of a turn.
     for name in () if rows else list(wires):
-        if rows or len(asked) < _MAX_SEARCHES:
-            asked.append(name)
+        if rows or len(searched) < _MAX_SEARCHES:
+            searched.append(name)
             identify(name, session.channels)
     # Rows of a table start together: where one signal matches from several starts, another one decides.
     for table in {id(recorded[name].table) for name in rows}:
@@ -222,30 +222,30 @@ def identify_signals(
         choices = list(dict.fromkeys(rows[name].offset for name in names))
 
         def agreed(offset: int) -> int:
-            signals = [(each, found[each].channel, offset, rows[each].scale) for each in names]  # noqa: B023
+            signals = [(each, wired[each].channel, offset, rows[each].scale) for each in names]  # noqa: B023
             return sum(search.compare(*signal)[0] for signal in signals)
 
         best = max(choices, key=agreed) if choices[1:] else choices[0]
-        signals = [(each, found[each].channel, rows[each].scale) for each in names]
+        signals = [(each, wired[each].channel, rows[each].scale) for each in names]
         for other in dict.fromkeys([*choices, *search.offsets.values()]):
-            best = other if search.is_better(other, best, signals, known=other not in choices) else best
+            best = other if search.is_better(other, best, signals, shared=other not in choices) else best
         search.offsets[table] = best
         for name in names:
-            one, group = rows[name], session.channels[found[name].channel].group
+            one, group = rows[name], session.channels[wired[name].channel].group
             rows[name] = search.make_rows(one.scale, one.step, search.offsets[table], group)
 
     def is_shown(name: str) -> bool:
         one = rows[name]
-        return one.scale.clean and search.compare(name, found[name].channel, one.offset, one.scale)[1] > _MIN_EQUAL_PART
+        return one.scale.clean and search.compare(name, wired[name].channel, one.offset, one.scale)[1] > _MIN_EQUAL_PART
 
     # Channels of noise alone correlate with none: their counts are found from the start of another signal.
     if 2 * len(rows) <= len(wires) and not any(map(is_shown, rows)):
-        return found, rows
+        return wired, rows
     for name, wire in wires.items():
-        used = {found[each].channel for each in rows}
+        used = {wired[each].channel for each in rows}
         for other in () if name in rows else sorted(session.channels, key=lambda each: (each != name, each in used)):
             if (one := search.find_rows(name, other)) is not None:
-                found[name], rows[name] = replace(wire, channel=other, rivals=()), one
+                wired[name], rows[name] = replace(wire, channel=other, rivals=()), one
                 break
         named = name if name in session.channels else "" if wire.rivals else wire.channel
         if name not in rows and named:
@@ -256,19 +256,19 @@ def identify_signals(
             def deviation(scale: Scale) -> float:
                 return float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values)) / scale.each)  # noqa: B023
 
-            found[name] = replace(wire, channel=named)
+            wired[name] = replace(wire, channel=named)
             scale = replace(min(scales(unit, channel, values[:0], counts), key=deviation), known=False)
             rows[name] = search.make_rows(scale, step, offset, channel.group)
-    known = {name: each for name, each in rows.items() if each.scale.known}
+    exact = {name: each for name, each in rows.items() if each.scale.known}
     # A DAQ's converter leaves out bits of all signals equally; if one signal has fewer bits, they are lost later.
-    adc_bits = {name: session.channels[found[name].channel].adc_bits for name in known}
-    bits = {name: adc_bits[name] - each.scale.lost_bits for name, each in known.items()}
-    for name, each in known.items():
+    adc_bits = {name: session.channels[wired[name].channel].adc_bits for name in exact}
+    bits = {name: adc_bits[name] - each.scale.lost_bits for name, each in exact.items()}
+    for name, each in exact.items():
         if each.scale.lost_bits and bits[name] < max(bits.values()):
             size = 2.0**-each.scale.lost_bits
             scale = Scale(size * each.scale.each, each.scale.zero, each.scale.what, known=False)
             rows[name] = replace(each, scale=scale)
-    return found, rows
+    return wired, rows
 
 
 def _decimate(values: np.ndarray) -> np.ndarray:

@@ -194,12 +194,12 @@ class _Walk:
 
     def _cut_blocks(self, ds: np.ndarray) -> list[int]:
         """Return the edges of blocks that are long enough to determine their time error."""
-        known = np.cumsum(np.nan_to_num(ds**2).sum(axis=0))
+        information = np.cumsum(np.nan_to_num(ds**2).sum(axis=0))
         edges = [0]
         while True:
-            begun = known[edges[-1] - 1] if edges[-1] else 0.0
-            at = max(edges[-1] + _MIN_BLOCK_ROWS, int(np.searchsorted(known, begun + self._need)) + 1)
-            if at > len(known):
+            begun = information[edges[-1] - 1] if edges[-1] else 0.0
+            at = max(edges[-1] + _MIN_BLOCK_ROWS, int(np.searchsorted(information, begun + self._need)) + 1)
+            if at > len(information):
                 return edges
             edges.append(at)
 
@@ -228,8 +228,8 @@ class _Walk:
             final = inside < count or row + inside == self._rows
             for n, (a, b) in enumerate(pairwise(edges)):
                 part = slice(_REACH + a, _REACH + b)
-                error, good, known = _fit(y[:, part], s[:, part], ds[:, part])
-                shown = known >= self._need
+                error, good, information = _fit(y[:, part], s[:, part], ds[:, part])
+                shown = information >= self._need
                 if (shown and abs(error) > _STEP_THRESHOLD) or not good:
                     if n > 0 and len(edges) - n < 4 and not final:
                         edges = edges[: n + 1]  # the blocks that follow are needed
@@ -315,22 +315,22 @@ class _Walk:
                 np.where(np.isfinite(values), np.nan_to_num(ds[:, part]), 0.0),
             )
             sums = [(1e6 * missing + r**2), r * slope, slope**2]
-            left, pull, known = (np.cumsum(each.sum(axis=0)[::-1])[::-1][: 1 - _MIN_END_ROWS] for each in sums)
-            error = np.clip(pull / np.maximum(known, 1e-300), -_STEP_THRESHOLD, _STEP_THRESHOLD)
-            return left - error * (2.0 * pull - error * known)
+            rest, pull, info = (np.cumsum(each.sum(axis=0)[::-1])[::-1][: 1 - _MIN_END_ROWS] for each in sums)
+            error = np.clip(pull / np.maximum(info, 1e-300), -_STEP_THRESHOLD, _STEP_THRESHOLD)
+            return rest - error * (2.0 * pull - error * info)
 
         usual = counted * np.arange(last - first, 0, -1.0)[: 1 - _MIN_END_ROWS]
         unmoved, least = to_end(0), 2.0 * self._limit
         if not len(usual) or (unmoved - usual).max() < least:
             return None
-        found: list[tuple[int, float, bool]] = []
+        steps: list[tuple[int, float, bool]] = []
         for moved in sorted(set(range(-reach, reach + 1)) - {0}, key=abs):
-            left = to_end(moved)
-            at = int((unmoved - left).argmax())
-            good = left[at] <= max(_MAX_RESIDUAL_RATIO * usual[at], _MAX_END_PART * unmoved[at])
-            found.append((moved, float(unmoved[at] - left[at]), bool(good)))
-        most = max(gained for _, gained, _ in found)
-        moved, gained, good = next(each for each in found if each[1] >= most - least)
+            rest = to_end(moved)
+            at = int((unmoved - rest).argmax())
+            good = rest[at] <= max(_MAX_RESIDUAL_RATIO * usual[at], _MAX_END_PART * unmoved[at])
+            steps.append((moved, float(unmoved[at] - rest[at]), bool(good)))
+        most = max(gained for _, gained, _ in steps)
+        moved, gained, good = next(each for each in steps if each[1] >= most - least)
         return (moved, row + last - _REACH) if gained > least and good else None
 
     @property
@@ -355,23 +355,23 @@ class _Walk:
         for start in range(math.ceil(low), math.floor(high) - count, _SEARCH_INSTANTS - count):
             at = np.arange(start, min(math.floor(high), start + _SEARCH_INSTANTS))
             place = at + line[1] + line[2] * (at - line[0])
-            known = one.gain * one.stimulus(self._first_s + one.late_s + place * self._period_s)[0]
-            sums = np.cumsum(np.concatenate([[0.0], known**2]))
-            left = float(here @ here) - 2.0 * correlate(known, here, "valid", "fft") + sums[count:] - sums[:-count]
-            near = np.flatnonzero(left <= left.min() + 2.0 * self._limit * one.noise**2)
+            sent = one.gain * one.stimulus(self._first_s + one.late_s + place * self._period_s)[0]
+            sums = np.cumsum(np.concatenate([[0.0], sent**2]))
+            power = float(here @ here) - 2.0 * correlate(sent, here, "valid", "fft") + sums[count:] - sums[:-count]
+            near = np.flatnonzero(power <= power.min() + 2.0 * self._limit * one.noise**2)
             moved = near + start - row - lag
-            best = min(best, (float(left.min()), int(moved[np.argmin(np.abs(moved))])))
+            best = min(best, (float(power.min()), int(moved[np.argmin(np.abs(moved))])))
         if best[0] > _MIN_EXPLAINED_PART * count * float(np.var(here)):
             return None
         return (best[1], row) if best[1] else None
 
     def _locate_step(self, line: np.ndarray, lag: int, moved: int, first: int, last: int) -> tuple[int, int]:
         """Return the first and last row at which a step may start."""
-        left = []
+        sums = []
         for each in (lag, lag + moved):
             y, s, _ = self._evaluate(first, last, line, each)
-            left.append(np.concatenate([[0.0], np.cumsum(np.nan_to_num((y - s) ** 2, nan=1e6).sum(axis=0))]))
-        cost = left[0] + left[1][-1] - left[1]
+            sums.append(np.concatenate([[0.0], np.cumsum(np.nan_to_num((y - s) ** 2, nan=1e6).sum(axis=0))]))
+        cost = sums[0] + sums[1][-1] - sums[1]
         place = int(np.argmin(cost))
         near = np.flatnonzero(cost <= cost[place] + 2.0 * self._limit)
         return first + int(near[0]), first + int(near[-1])
@@ -384,15 +384,15 @@ def _fit(y: np.ndarray, s: np.ndarray, ds: np.ndarray, least: float = _MIN_EXPLA
     """
     use = np.isfinite(y) & np.isfinite(s)
     r, slope = np.where(use, y - s, 0.0), np.where(use, ds, 0.0)
-    known, error = float(np.sum(slope**2)), time_error(slope, r)
+    information, error = float(np.sum(slope**2)), time_error(slope, r)
     if abs(error) < 1.0:
         r = r - error * slope
     rows = use.sum(axis=1)
     power = np.where(use, y, 0.0)
     whole = np.sum(power**2, axis=1) - power.sum(axis=1) ** 2 / np.maximum(rows, 1)
-    left = np.sum(r**2, axis=1)
-    good = ((left <= _MAX_RESIDUAL_RATIO * rows) | (left <= least * whole))[rows > 0]
-    return error, bool(2 * good.sum() >= len(good)), known
+    squares = np.sum(r**2, axis=1)
+    good = ((squares <= _MAX_RESIDUAL_RATIO * rows) | (squares <= least * whole))[rows > 0]
+    return error, bool(2 * good.sum() >= len(good)), information
 
 
 def _is_period(y: np.ndarray, s: np.ndarray, ds: np.ndarray, last: int, moved: int) -> bool:
@@ -424,17 +424,17 @@ def _best_step(y: np.ndarray, s: np.ndarray, ds: np.ndarray, certain: float) -> 
     """
     from scipy.signal import correlate
 
-    left, pull, known = (np.zeros(2 * _REACH + 1) for _ in range(3))
+    power, pull, info = (np.zeros(2 * _REACH + 1) for _ in range(3))
     usable = ~np.isnan(s).any(axis=0)
     for values, signal, slope in zip(np.nan_to_num(y), np.nan_to_num(s), np.nan_to_num(ds), strict=True):
         kept = np.isfinite(values).astype(float)
-        left += values @ values - 2.0 * correlate(signal, values, "valid") + correlate(signal**2, kept, "valid")
+        power += values @ values - 2.0 * correlate(signal, values, "valid") + correlate(signal**2, kept, "valid")
         pull += correlate(slope, values, "valid") - correlate(slope * signal, kept, "valid")
-        known += correlate(slope**2, kept, "valid")
-    error = np.clip(pull / np.maximum(known, 1e-300), -0.6, 0.6)
-    left -= error * (2.0 * pull - error * known)
-    left[correlate(usable.astype(float), np.ones(y.shape[1]), "valid") < y.shape[1] - 0.5] = np.inf
-    near = np.flatnonzero(left <= left.min() + 2.0 * certain)
+        info += correlate(slope**2, kept, "valid")
+    error = np.clip(pull / np.maximum(info, 1e-300), -0.6, 0.6)
+    power -= error * (2.0 * pull - error * info)
+    power[correlate(usable.astype(float), np.ones(y.shape[1]), "valid") < y.shape[1] - 0.5] = np.inf
+    near = np.flatnonzero(power <= power.min() + 2.0 * certain)
     at = int(near[np.argmin(np.abs(near - _REACH))])
     part = slice(at, at + y.shape[1])
     return at - _REACH if _fit(y, s[:, part], ds[:, part], 0.0)[1] else None

@@ -155,12 +155,12 @@ def find_busiest(sources: Sequence[RowSource], within: tuple[int, int], length: 
 
 def _fit_stretches(sources: Sequence[RowSource], shift_s: float, stretch: tuple[int, int]) -> dict[str, Waveform]:
     """Return the fits of a stretch from one start, of the signals that are found in it."""
-    found = {}
+    fits = {}
     for one in sources:
         fit = fit_stretch(one.values, one.times_s, one.stimulus, one.offset_s + shift_s, stretch)
         if fit is not None and fit.likeness > MIN_LIKENESS and abs(fit.drift) < _MAX_DRIFT:
-            found[one.name] = fit
-    return found
+            fits[one.name] = fit
+    return fits
 
 
 def _refine_shift_s(one: RowSource, shift_s: float, stretch: tuple[int, int]) -> float:
@@ -171,16 +171,16 @@ def _refine_shift_s(one: RowSource, shift_s: float, stretch: tuple[int, int]) ->
     grid_s = first_s + np.arange(-reach, _OVERSAMPLING * (n - 1) + reach + 1) * (period_s / _OVERSAMPLING)
     if grid_s[0] < one.stimulus.span_s[0] or grid_s[-1] > one.stimulus.span_s[1]:
         return shift_s
-    known, _ = one.stimulus(grid_s)
-    windows = np.lib.stride_tricks.sliding_window_view(known, _OVERSAMPLING * (n - 1) + 1)[:, ::_OVERSAMPLING]
-    spread = np.maximum(windows.std(axis=1), 1e-12 * max(1e-300, float(known.std())))
+    sent, _ = one.stimulus(grid_s)
+    windows = np.lib.stride_tricks.sliding_window_view(sent, _OVERSAMPLING * (n - 1) + 1)[:, ::_OVERSAMPLING]
+    spread = np.maximum(windows.std(axis=1), 1e-12 * max(1e-300, float(sent.std())))
     alike = np.abs(windows @ (y - y.mean())) / spread
     at = np.flatnonzero((alike[1:-1] >= alike[:-2]) & (alike[1:-1] > alike[2:])) + 1
     at = at[np.argsort(-alike[at])][:_MAX_CANDIDATES]
     shifts = [shift_s, *(shift_s + (at - reach) * period_s / _OVERSAMPLING)]
     fits = [fit_stretch(one.values, one.times_s, one.stimulus, one.offset_s + each, stretch) for each in shifts]
-    left = [math.inf if fit is None else float(np.var(fit.residual)) for fit in fits]
-    return float(shifts[int(np.argmin(left))])
+    power = [math.inf if fit is None else float(np.var(fit.residual)) for fit in fits]
+    return float(shifts[int(np.argmin(power))])
 
 
 def follow(sources: Sequence[RowSource], shift_s: float, stretches: Sequence[tuple[int, int]]) -> Alignment | None:
@@ -197,11 +197,11 @@ def follow(sources: Sequence[RowSource], shift_s: float, stretches: Sequence[tup
         at_s = shift_s if n else near_s
         fits = _fit_stretches(sources, at_s, stretch)
         if fits:
-            left = float(
-                np.median([np.std(each.residual) / abs(each.gain) / np.std(each.known) for each in fits.values()])
+            ratio = float(
+                np.median([np.std(each.residual) / abs(each.gain) / np.std(each.sent) for each in fits.values()])
             )
-            if best is None or len(fits) > 2 * len(best[2]) or left < _MAX_RESIDUAL_RATIO * best[0]:
-                best = left, stretch, fits
+            if best is None or len(fits) > 2 * len(best[2]) or ratio < _MAX_RESIDUAL_RATIO * best[0]:
+                best = ratio, stretch, fits
     if best is None:
         return None
     _, stretch, fits = best

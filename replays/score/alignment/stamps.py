@@ -34,13 +34,13 @@ class Stamps:
         self._means: list[np.ndarray] = []
         self._squares, self._dof = 0.0, 0
 
-    def add_rows(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
+    def add_rows(self, first_s: float, since_s: np.ndarray, identified: np.ndarray, rows: int) -> None:
         """Add rows to the batches.
 
         Args:
             first_s: Time at which the first row was sent [s].
             since_s: Time from then to the known ones of the next rows [s].
-            known: Indices of these rows.
+            identified: Indices of these rows.
             rows: Number of the next rows.
         """
         if not self._stamped or not rows:
@@ -48,7 +48,7 @@ class Stamps:
         times_s, size = self.times_s, self._size
         self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) < 0.0))
         self._last_s = float(times_s[-1])
-        apart = times_s[known] - first_s - since_s
+        apart = times_s[identified] - first_s - since_s
         for start in range(0, len(apart) - size + 1, size):
             late = apart[start : start + size]
             self._means.append(np.array([since_s[start : start + size].mean(), late.mean()]))
@@ -65,23 +65,23 @@ class Stamps:
         names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
         if not self._stamped:
             return dict.fromkeys(names)
-        found: dict[str, Interval | None] = dict.fromkeys(names)
-        found["stamps that go back"] = (float(self._back),) * 3
+        estimates: dict[str, Interval | None] = dict.fromkeys(names)
+        estimates["stamps that go back"] = (float(self._back),) * 3
         if len(self._means) < 8:
-            return found
+            return estimates
         # Rows that arrived in bursts are not independent: several batches count as one.
         several = max(1, len(self._means) // _JUDGED_BATCHES)
         whole = np.array(self._means[: len(self._means) // several * several])
         since, late = whole.reshape(-1, several, 2).mean(axis=1).T
         line = fit_line(since, late)
-        found["stamp rate"] = make_interval(line.slope, line.half_widths[0], 1e6)
-        found["stamp offset"] = make_interval(line.at_zero, line.half_widths[1])
+        estimates["stamp rate"] = make_interval(line.slope, line.half_widths[0], 1e6)
+        estimates["stamp offset"] = make_interval(line.at_zero, line.half_widths[1])
         if wall_s is not None and abs(late.mean() - wall_s) < apart_s:
             value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
-            found["latency"] = make_interval(float(value), float(wide))
+            estimates["latency"] = make_interval(float(value), float(wide))
         jitter_s, (low, high) = math.sqrt(self._squares / self._dof), chi2_mean_ends(self._dof)
-        found["stamp jitter"] = jitter_s, jitter_s / math.sqrt(high), jitter_s / math.sqrt(low)
-        return found
+        estimates["stamp jitter"] = jitter_s, jitter_s / math.sqrt(high), jitter_s / math.sqrt(low)
+        return estimates
 
     def batch_means(self) -> np.ndarray:
         """Return the time since the first row and the lateness of each batch [s], shape (n, 2)."""

@@ -126,23 +126,23 @@ def _read_property(channel: Channel, what: Property, amplitude: float) -> float:
     }[what]
 
 
-def load_limits(given: Path | str | None = None) -> ScoreLimits:
+def load_limits(source: Path | str | None = None) -> ScoreLimits:
     """Load limits: a set of the rig's by its name, or a file.
 
     Raises:
         InputError: The limits do not exist, or are invalid; the message has the first error.
     """
-    path = Path(DEFAULT if given is None else given)
+    path = Path(DEFAULT if source is None else source)
     shipped = {file.stem: file for file in FOLDER.glob("*.toml")}
     if path.suffix != ".toml":
         if str(path) not in shipped:
             raise UnknownNameError("limits", "a .toml file or a set of the rig's", str(path), sorted(shipped))
         path = shipped[str(path)]
     limits = check(ScoreLimits, read_toml(path), field=path.name)
-    for name, known in (("digital", DIGITAL), ("analogue", ANALOGUE)):
+    for name, quantities in (("digital", DIGITAL), ("analogue", ANALOGUE)):
         for quantity, limit in getattr(limits, name).items():
-            if quantity not in known:
-                raise UnknownNameError(f"{path.name}: {name}", "a quantity of a scorecard", quantity, known)
+            if quantity not in quantities:
+                raise UnknownNameError(f"{path.name}: {name}", "a quantity of a scorecard", quantity, quantities)
             where = f"{path.name}: {name}.{quantity}"
             if limit.low is None and limit.high is None:
                 raise InputError(where, "with low or high", None)

@@ -177,14 +177,14 @@ class ScoreRow:
 
     def cells(self) -> tuple[str, ...]:
         """Return quantity, channel, value, interval, unit, limit and verdict as text."""
-        known = self.is_known
-        exact = self.low == self.high or not known
+        is_known = self.is_known
+        exact = self.low == self.high or not is_known
         digits = 6
         if not exact and math.isfinite(self.high - self.low):  # enough digits to distinguish the two ends
             largest = max(abs(self.low), abs(self.high))
             digits = min(15, max(6, math.ceil(math.log10(largest / (self.high - self.low))) + 2))
         interval = "" if exact else f"{self.low:.{digits}g} to {self.high:.{digits}g}"
-        value = self.value if isinstance(self.value, str) else f"{self.value:.{digits}g}" if known else ""
+        value = self.value if isinstance(self.value, str) else f"{self.value:.{digits}g}" if is_known else ""
         return (
             self.quantity, self.channel, value, interval, "" if self.unit == "1" else self.unit,
             "" if self.limit is None else str(self.limit), self.verdict,
@@ -299,8 +299,8 @@ class Scorecard:
         for row in self.rows:
             if row.verdict == FAIL:
                 failed.setdefault(row.channel, set()).add(row.quantity)
-        found = {name: defects_shown(each, digital=self.path == "digital") for name, each in failed.items()}
-        return {name: each for name, each in found.items() if each}
+        defects = {name: defects_shown(each, digital=self.path == "digital") for name, each in failed.items()}
+        return {name: each for name, each in defects.items() if each}
 
     @property
     def findings(self) -> list[str]:
@@ -348,8 +348,8 @@ def make_matrix(card: Scorecard) -> tuple[list[str], list[tuple[str, ...]]]:
     columns = [*names, *([""] if any(not row.channel for row in card.rows) else [])]
     lines: list[tuple[str, ...]] = []
     for quantity in dict.fromkeys(row.quantity for row in card.rows) if len(names) > 1 else ():
-        found = [{row.verdict for row in card.rows if (row.quantity, row.channel) == (quantity, c)} for c in columns]
-        lines.append((quantity, *(next((mark for each, mark in MARKS.items() if each in some), "") for some in found)))
+        marks = [{row.verdict for row in card.rows if (row.quantity, row.channel) == (quantity, c)} for c in columns]
+        lines.append((quantity, *(next((mark for each, mark in MARKS.items() if each in some), "") for some in marks)))
     return [each or "all" for each in columns], lines
 
 

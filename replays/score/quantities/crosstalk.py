@@ -36,15 +36,15 @@ def find_crosstalk(
 
     # A drift correlates with any slow signal: mean and slope of each block are removed.
     blocks = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)[1:-1]
-    left, *columns = (detrend(each, bp=blocks) for each in (residual, *sources, *own))
+    detrended, *columns = (detrend(each, bp=blocks) for each in (residual, *sources, *own))
     sizes = np.array([max(float(np.std(each)), 1e-300) for each in columns])
     matrix = np.column_stack([each / size for each, size in zip(columns, sizes, strict=True)])
     likeness = matrix.T @ matrix / len(matrix)
     own_part = 1.0 / np.diag(np.linalg.inv(likeness + 1e-9 * np.eye(len(sizes))))[: len(sources)]
     if own_part.min() < _MIN_SEPARATE_PART:
         return int(own_part.argmin()), None
-    parts, *moved = solve(matrix, np.column_stack([left, *map(detrend, errors)])).T
-    covariance, dof = sandwich(matrix, left - matrix @ parts)
+    parts, *moved = solve(matrix, np.column_stack([detrended, *map(detrend, errors)])).T
+    covariance, dof = sandwich(matrix, detrended - matrix @ parts)
     held, own_size = slice(len(sources)), sizes[len(sources)]
     sizes, parts = sizes[held], np.abs(parts[held] / sizes[held])
     value, low, high = bound_maximum(parts, np.sqrt(np.diag(covariance)[held]) / sizes, dof[held])

@@ -20,40 +20,40 @@ class NoiseSplit:
     """Noise of the voltage and of the sampling instants, each as value, low and high end of its 95 % interval.
 
     Attributes:
-        left: Whole residual, rms [unit].
+        total: Whole residual, rms [unit].
         noise: Part of the residual that is independent of the slope, rms [unit].
         jitter_s: Jitter, rms [s]; None if the signal's slope does not vary.
     """
 
-    left: tuple[float, float, float]
+    total: tuple[float, float, float]
     noise: tuple[float, float, float]
     jitter_s: tuple[float, float, float] | None
 
 
-def split_noise(found: Waveform, *, floor: float = 0.0, steps: bool = False) -> NoiseSplit:
+def split_noise(fit: Waveform, *, floor: float = 0.0, steps: bool = False) -> NoiseSplit:
     """Separate jitter from noise: residual^2 = noise^2 + (gain slope)^2 jitter^2, by weighted least squares.
 
     Args:
-        found: A fit.
+        fit: A fit.
         floor: Noise that may be due to the known signal itself [unit rms]: extends both intervals downward.
         steps: Whether rounding shows in the residual: its power may depend on the slope, as that of jitter does.
     """
-    slow = wander_columns(found.residual)
+    slow = wander_columns(fit.residual)
     # A wander is part of the noise, and its power is that of this record.
-    wander = (slow @ (slow.T @ found.residual) * 2.0 / len(slow)) ** 2
-    squared, steep = found.residual**2, (found.gain * found.slope) ** 2
+    wander = (slow @ (slow.T @ fit.residual) * 2.0 / len(slow)) ** 2
+    squared, steep = fit.residual**2, (fit.gain * fit.slope) ** 2
     typical = float(np.mean(steep))
     ones = np.ones(len(squared))
     if not (typical > 0.0 and float(np.std(steep)) > 0.05 * typical):
-        (left,) = _fit_powers(squared, wander, [ones], floor)
-        return NoiseSplit(left, left, None)
+        (total,) = _fit_powers(squared, wander, [ones], floor)
+        return NoiseSplit(total, total, None)
     noise, late = _fit_powers(squared, wander, [ones, steep / typical], floor)
     # The noise that the threshold kept or removed is below twice the known signal's noise, and may be in steep parts.
-    known = 2.0 * floor * typical / math.sqrt(float(np.mean(steep**2)))
-    late = late[0], 0.0 if steps else math.sqrt(max(0.0, late[1] ** 2 - known**2)), late[2]
-    (left,) = _fit_powers(squared, wander + late[0] ** 2 * steep / typical, [ones], floor)
+    wander_error = 2.0 * floor * typical / math.sqrt(float(np.mean(steep**2)))
+    late = late[0], 0.0 if steps else math.sqrt(max(0.0, late[1] ** 2 - wander_error**2)), late[2]
+    (total,) = _fit_powers(squared, wander + late[0] ** 2 * steep / typical, [ones], floor)
     size = math.sqrt(typical)
-    return NoiseSplit(left, noise, (late[0] / size, late[1] / size, late[2] / size))
+    return NoiseSplit(total, noise, (late[0] / size, late[1] / size, late[2] / size))
 
 
 def _fit_powers(
@@ -84,7 +84,7 @@ def _fit_powers(
     rest = (fast - matrix @ parts) * root
     both = np.column_stack([matrix * root[:, None], slow := wander_columns(rest)])
     rest = rest - slow @ (slow.T @ rest) * 2.0 / len(rest)
-    covariance, dof = (found[..., : len(parts)] for found in sandwich(both, rest, even=True))
+    covariance, dof = (each[..., : len(parts)] for each in sandwich(both, rest, even=True))
     half = student(dof) * np.sqrt(np.diag(covariance))
     parts[0] += np.mean(wander)
     # Few independent squares have a skewed chi-squared distribution: the ends are at equal ratios.

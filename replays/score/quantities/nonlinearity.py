@@ -45,27 +45,27 @@ _EDGE_NOISES = 4.0
 """Distance from the ends of the ramp, in noises, within which the converter may limit."""
 
 
-def _fit_two_tones(n: np.ndarray, known: np.ndarray) -> tuple[list[float], float] | None:
+def _fit_two_tones(n: np.ndarray, sent: np.ndarray) -> tuple[list[float], float] | None:
     """Return the frequencies [cycles per row] and the power [unit^2] of two tones; None for any other signal."""
-    if len(known) < _SEGMENT_ROWS or not np.var(known):
+    if len(sent) < _SEGMENT_ROWS or not np.var(sent):
         return None
-    first = fit_sine(known[:_SEARCH_ROWS])
+    first = fit_sine(sent[:_SEARCH_ROWS])
     second = fit_sine(first.residual)
-    if np.var(second.residual) > _MAX_FIRST_RESIDUAL * np.var(known):
+    if np.var(second.residual) > _MAX_FIRST_RESIDUAL * np.var(sent):
         return None
-    tones, parts, _, left = fit_tones(n, known, np.array([first.frequency[0], second.frequency[0]]), _PHASE_TOLERANCE)
+    tones, parts, _, rest = fit_tones(n, sent, np.array([first.frequency[0], second.frequency[0]]), _PHASE_TOLERANCE)
     powers = 0.5 * (parts[:2] ** 2 + parts[2:4] ** 2)
-    if np.var(left) > _MAX_OTHER_POWER * np.var(known) or powers.max() > _TONE_RATIO * powers.min():
+    if np.var(rest) > _MAX_OTHER_POWER * np.var(sent) or powers.max() > _TONE_RATIO * powers.min():
         return None
     return sorted(tones.tolist()), float(powers.sum())
 
 
-def intermodulation(times_s: np.ndarray, known: np.ndarray, residual: np.ndarray, gain: float) -> Interval | None:
+def intermodulation(times_s: np.ndarray, sent: np.ndarray, residual: np.ndarray, gain: float) -> Interval | None:
     """Return the intermodulation distortion [dB]: products of second and third order over the two tones, rms.
 
     Args:
         times_s: Times of the rows, even except for lost ones [s], shape (n,).
-        known: The known signal, shape (n,).
+        sent: The known signal, shape (n,).
         residual: Residual of the record [unit], shape (n,).
         gain: Gain of the record.
 
@@ -74,10 +74,10 @@ def intermodulation(times_s: np.ndarray, known: np.ndarray, residual: np.ndarray
     """
     n = np.rint((times_s - times_s[0]) / np.median(np.diff(times_s)))
     n -= 0.5 * n[-1]
-    found = _fit_two_tones(n, known)
-    if found is None:
+    tones = _fit_two_tones(n, sent)
+    if tones is None:
         return None
-    (low, high), power = found
+    (low, high), power = tones
     least, turns, counted = 2.0 / len(n), list[float](), 0
     for number, (a, b) in enumerate(_ORDERS):
         # A product beyond half of the rate, or close to a tone or another product, is not separable.
@@ -112,13 +112,13 @@ class Transfer:
     code_samples: float
 
 
-def _fit_ramp(times_s: np.ndarray, known: np.ndarray, span: float) -> np.ndarray | None:
+def _fit_ramp(times_s: np.ndarray, sent: np.ndarray, span: float) -> np.ndarray | None:
     """Return the lines of a ramp through the known signal, nan next to its jumps, shape (n,); or None."""
-    ramp = np.full(len(known), np.nan)
-    for a, b in split_at_breaks(np.abs(np.diff(known)) > _JUMP * span):
+    ramp = np.full(len(sent), np.nan)
+    for a, b in split_at_breaks(np.abs(np.diff(sent)) > _JUMP * span):
         if b - a > _SEGMENT_ROWS + 2 * _RING_ROWS:
             part = slice(a + _RING_ROWS, b - _RING_ROWS)
-            line = fit_line(times_s[part], known[part])
+            line = fit_line(times_s[part], sent[part])
             ramp[part] = line(times_s[part])
             if np.std(line.residual) > _MAX_CURVATURE * span:
                 return None
@@ -126,20 +126,20 @@ def _fit_ramp(times_s: np.ndarray, known: np.ndarray, span: float) -> np.ndarray
     return ramp if held.any() and np.ptp(ramp[held]) > _MIN_SWEEP * span else None
 
 
-def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, span: float) -> Transfer | None:
+def transfer_curve(times_s: np.ndarray, sent: np.ndarray, values: np.ndarray, span: float) -> Transfer | None:
     """Return INL and DNL by a slow ramp; None for another signal.
 
     The transfer curve is piecewise linear between 64 knots; intervals are simultaneous over knots and codes.
 
     Args:
         times_s: Times of the rows [s], shape (n,).
-        known: The known signal, without gain [unit], shape (n,).
+        sent: The known signal, without gain [unit], shape (n,).
         values: Recorded values [unit], shape (n,).
         span: The converter's range, from end to end [unit].
     """
     from scipy.sparse import csr_array
 
-    ramp = _fit_ramp(times_s, known, span)
+    ramp = _fit_ramp(times_s, sent, span)
     if ramp is None:
         return None
     low, high = np.nanmin(ramp), np.nanmax(ramp)
@@ -157,12 +157,12 @@ def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, s
     hats = csr_array(entries, shape=(len(x), _KNOTS + 1))
     inverse = compute_inverse((hats.T @ hats).toarray())
     curve = inverse @ (hats.T @ line.residual)
-    left = line.residual - hats @ curve
+    residual = line.residual - hats @ curve
     block = max(1, len(x) // (8 * _KNOTS))  # coloured noise has block means with a larger variance
-    variance = max(float(np.var(left)), block * float(np.var(block_means(left, block))))
+    variance = max(float(np.var(residual)), block * float(np.var(block_means(residual, block))))
     inl = bound_maximum(np.abs(curve), np.sqrt(np.diag(inverse) * variance))
     coverage = float(high - low) / span
-    dnl, samples = _code_widths(y, line(x), float(np.std(left)))
+    dnl, samples = _code_widths(y, line(x), float(np.std(residual)))
     size = 1e6 / span
     judged = (inl[0] * size, inl[1] * size, inl[2] * size) if coverage > _COVERAGE else None
     return Transfer(judged, dnl, coverage, samples)

@@ -34,13 +34,13 @@ _STEP_TOLERANCE = 1e-3
 
 def find_step(values: np.ndarray) -> float:
     """Return the step of which values are multiples [unit], or 0."""
-    found = np.unique(values[np.isfinite(values)][:_MAX_VALUES])
-    apart = np.diff(found)
-    apart = apart[apart > 1e-9 * max(1e-300, float(np.abs(found[[0, -1]]).max()))] if len(found) else apart
+    levels = np.unique(values[np.isfinite(values)][:_MAX_VALUES])
+    apart = np.diff(levels)
+    apart = apart[apart > 1e-9 * max(1e-300, float(np.abs(levels[[0, -1]]).max()))] if len(levels) else apart
     if not len(apart):
         return 0.0
     step = float(apart.min())
-    return step if np.abs(apart / step - np.rint(apart / step)).max() < _STEP_TOLERANCE * len(found) ** 0.5 else 0.0
+    return step if np.abs(apart / step - np.rint(apart / step)).max() < _STEP_TOLERANCE * len(levels) ** 0.5 else 0.0
 
 
 @dataclass(frozen=True)
@@ -63,34 +63,34 @@ class Converter:
         return math.hypot(self.noise, self.step / math.sqrt(12.0))
 
 
-def find_undithered(found: Waveform, step: float, session: Converter | None) -> tuple[Converter, ...]:
+def find_undithered(fit: Waveform, step: float, session: Converter | None) -> tuple[Converter, ...]:
     """Return the converters whose rounding is not dithered by noise.
 
     Args:
-        found: A fit.
+        fit: A fit.
         step: Step of the DAQ's converter [unit], or 0.
         session: Converter of the known signal; None if the signal is known by a formula.
     """
     # The sensor's noise is the same at the input of the DAQ as at that of the session's converter.
     rounding = (step**2 + (session.step**2 if session else 0.0)) / 12.0
-    noise = math.sqrt(max(0.0, float(np.mean(found.residual**2)) - rounding))
+    noise = math.sqrt(max(0.0, float(np.mean(fit.residual**2)) - rounding))
     both = (Converter(step, noise), *((session,) if session else ()))
-    least = _MIN_STEP * float(np.std(found.residual))
+    least = _MIN_STEP * float(np.std(fit.residual))
     return tuple(each for each in both if each.step > least and each.noise <= _MIN_DITHER * each.step)
 
 
-def find_rounding_errors(found: Waveform, converters: Sequence[Converter], rows: slice | np.ndarray) -> np.ndarray:
+def find_rounding_errors(fit: Waveform, converters: Sequence[Converter], rows: slice | np.ndarray) -> np.ndarray:
     """Return the possible errors of rounding in a fit, in addition to its noise [unit].
 
     Args:
-        found: A fit.
+        fit: A fit.
         converters: Converters that may cause them.
         rows: Rows of the fit.
 
     Returns:
         Expected error for each of the tried places of the steps, shape (m, n); (0, n) without converters.
     """
-    fitted = found.values[rows] - found.residual[rows]
+    fitted = fit.values[rows] - fit.residual[rows]
     errors = np.zeros((len(_PEAK_SHIFTS) if converters else 0, _PHASES, len(fitted)))
     for one, (turn, each) in product(converters, zip(_PEAK_SHIFTS, errors, strict=False)):
         values = fitted if one.values is None else one.values[rows]
@@ -105,19 +105,19 @@ def find_rounding_errors(found: Waveform, converters: Sequence[Converter], rows:
     return errors.reshape(-1, len(fitted))
 
 
-def widen_intervals(found: Waveform, converters: Sequence[Converter]) -> Waveform:
+def widen_intervals(fit: Waveform, converters: Sequence[Converter]) -> Waveform:
     """Return a fit whose intervals include the effect of rounding on its five parameters.
 
     Args:
-        found: A fit.
+        fit: A fit.
         converters: Converters whose rounding may cause errors.
     """
     if not converters:
-        return found
-    rows = np.unique(np.linspace(0, len(found.residual) - 1, _MAX_ROWS).astype(int))
-    errors = find_rounding_errors(found, converters, rows)
-    known, slope, since = found.known[rows], found.slope[rows], found.times_s[rows] - found.middle_s
-    late = [slope, slope * since, slope * 0.5 * (since**2 - found.half_s**2 / 3.0)]
-    columns = np.column_stack([known, np.ones(len(since)), *(found.gain * each for each in late)])
+        return fit
+    rows = np.unique(np.linspace(0, len(fit.residual) - 1, _MAX_ROWS).astype(int))
+    errors = find_rounding_errors(fit, converters, rows)
+    sent, slope, since = fit.sent[rows], fit.slope[rows], fit.times_s[rows] - fit.middle_s
+    late = [slope, slope * since, slope * 0.5 * (since**2 - fit.half_s**2 / 3.0)]
+    columns = np.column_stack([sent, np.ones(len(since)), *(fit.gain * each for each in late)])
     moved = solve(columns, errors.T)
-    return replace(found, covariance=found.covariance + np.diag((np.abs(moved).max(axis=1) / student(found.dof)) ** 2))
+    return replace(fit, covariance=fit.covariance + np.diag((np.abs(moved).max(axis=1) / student(fit.dof)) ** 2))

@@ -43,31 +43,31 @@ class StepResponse:
     steps: int
 
 
-def has_steps(known: np.ndarray) -> bool:
+def has_steps(sent: np.ndarray) -> bool:
     """Return whether a signal consists of steps between two levels that are steeper than a response."""
-    low, high = np.percentile(known, (5.0, 95.0))
-    near = np.minimum(np.abs(known - low), np.abs(known - high)) < _LEVEL_PART * (high - low)
-    return bool(high > low and np.sum(~near) <= _MAX_EDGE_ROWS * len(_find_edges(known)))
+    low, high = np.percentile(sent, (5.0, 95.0))
+    near = np.minimum(np.abs(sent - low), np.abs(sent - high)) < _LEVEL_PART * (high - low)
+    return bool(high > low and np.sum(~near) <= _MAX_EDGE_ROWS * len(_find_edges(sent)))
 
 
-def _find_edges(known: np.ndarray) -> np.ndarray:
+def _find_edges(sent: np.ndarray) -> np.ndarray:
     """Return the rows after which a signal passes the middle of its levels, shape (n,)."""
-    above = known > 0.5 * np.sum(np.percentile(known, (5.0, 95.0)))
+    above = sent > 0.5 * np.sum(np.percentile(sent, (5.0, 95.0)))
     return np.flatnonzero(above[1:] != above[:-1])
 
 
-def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
+def step_response(sent: np.ndarray, values: np.ndarray) -> StepResponse | None:
     """Return the mean response to all steps whose plateaus are long enough; None if these are too few.
 
     Args:
-        known: The known signal, shape (n,).
+        sent: The known signal, shape (n,).
         values: Recorded values, shape (n,).
     """
     from scipy.interpolate import PchipInterpolator
 
-    middle = known - 0.5 * np.sum(np.percentile(known, (5.0, 95.0)))
-    edges = _find_edges(known)
-    gaps = np.diff(edges, prepend=-1, append=len(known))
+    middle = sent - 0.5 * np.sum(np.percentile(sent, (5.0, 95.0)))
+    edges = _find_edges(sent)
+    gaps = np.diff(edges, prepend=-1, append=len(sent))
     plateaus = np.minimum(gaps[:-1], gaps[1:])
     held = plateaus > max(_MIN_PLATEAU_ROWS, 0.5 * float(np.median(plateaus)) if len(plateaus) else 0.0)
     if held.sum() < _MIN_STEPS:

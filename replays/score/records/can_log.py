@@ -61,7 +61,7 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
         reason = build_read_error(path, error) if isinstance(error, OSError) else None
         raise reason or InputError("FILE", "an intact CAN log", Words(f"{path} ({type(error).__name__})")) from None
     fd = any(messages.by_name[name].fd for name in frames)
-    found = []
+    signals = []
     for name, (data, stamps) in frames.items():
         message = messages.by_name[name]
         form = message.samples
@@ -75,10 +75,10 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
         whole = RecordedTable(len(values), values.shape[1], _read_pieces(values, times_s))
         for column, (channel, bits) in enumerate(zip(form.channels, form.shifts.tolist(), strict=True)):
             if not np.isnan(values[:, column]).all():
-                found.append(Recorded(channel.name, channel.unit, whole, column, rates["rate"] / step, bits))
-    if not found:
+                signals.append(Recorded(channel.name, channel.unit, whole, column, rates["rate"] / step, bits))
+    if not signals:
         raise InputError("FILE", "a CAN log with samples of the rig", str(path))
-    return found
+    return signals
 
 
 def _read_pieces(values: np.ndarray, times_s: np.ndarray) -> Pieces:

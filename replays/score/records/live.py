@@ -126,9 +126,9 @@ def _measure_floor_s(folder: Path) -> float:
     os.close(write)
     while not lines.ended:
         time.sleep(_LOOK_S)
-    found = Arrivals(*lines.close(), 0.0)
+    arrivals = Arrivals(*lines.close(), 0.0)
     os.close(read)
-    return float(np.quantile(found.since_s(np.arange(_FLOOR_LINES)) + found.unix_s[0] - written_s, 0.95))
+    return float(np.quantile(arrivals.since_s(np.arange(_FLOOR_LINES)) + arrivals.unix_s[0] - written_s, 0.95))
 
 
 def collect(

@@ -51,9 +51,9 @@ class RecordedTable:
 
     def parts(self, columns: Sequence[int]) -> Iterator[np.ndarray]:
         """Yield stamps [s] and columns in parts of equal length, nan for values that no measurement has."""
-        held, left = list[np.ndarray](), self.rows
+        held, remaining = list[np.ndarray](), self.rows
         for piece in self._pieces(columns):
-            piece, left = piece[:left], left - len(piece[:left])
+            piece, remaining = piece[:remaining], remaining - len(piece[:remaining])
             with np.errstate(invalid="ignore"):
                 piece[:, 1:][~(np.abs(piece[:, 1:]) <= _MAX_VALUE)] = np.nan
             held.append(piece)
@@ -204,10 +204,10 @@ def open_recorded(path: Path, options: FileOptions | None = None, remarks: list[
         source = replace(source, entries=tuple(replace(each, rows=each.rows - 1) for each in source.entries))
     for entry in source.entries:
         tables.setdefault((entry.group, entry.rows), []).append(entry)
-    known = {key: RecordedTable(key[1], len(entries), _read_source(source, entries)) for key, entries in tables.items()}
+    read = {key: RecordedTable(key[1], len(entries), _read_source(source, entries)) for key, entries in tables.items()}
     return [
         Recorded(
-            entry.name, units.canonical(entry.unit), known[key := (entry.group, entry.rows)],
+            entry.name, units.canonical(entry.unit), read[key := (entry.group, entry.rows)],
             tables[key].index(entry), entry.rate_hz, group=entry.group,
         )
         for entry in source.entries
@@ -227,7 +227,7 @@ def map_signals(
     Raises:
         InputError: A channel or a source is unknown, or two channels have one source.
     """
-    found, changes = list[Recorded](), dict[int, dict[int, tuple[float, float]]]()
+    mapped, changes = list[Recorded](), dict[int, dict[int, tuple[float, float]]]()
     for name, wanted in mapping.items():
         where = f"channels.{name}"
         if name not in channels:
@@ -255,9 +255,9 @@ def map_signals(
             raise InputError(f"{where}.source", "of one channel only", wanted.source)
         if wanted.unit and unit not in COUNTS:
             unit = units.parse(unit, field=f"{where}.unit", also=COUNTS)
-        found.append(replace(signal, name=name, unit=unit))
-    tables = {id(s.table): s.table.changed(changes[id(s.table)]) for s in found}
-    return [replace(signal, table=tables[id(signal.table)]) for signal in found]
+        mapped.append(replace(signal, name=name, unit=unit))
+    tables = {id(s.table): s.table.changed(changes[id(s.table)]) for s in mapped}
+    return [replace(signal, table=tables[id(signal.table)]) for signal in mapped]
 
 
 def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded]:
@@ -269,7 +269,7 @@ def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded
         signals: Signals of a file.
         rate_hz: Row rate of a table that gives none [Hz].
     """
-    tables, found = dict[tuple[int, int, int, bytes], RecordedTable](), list[Recorded]()
+    tables, separated = dict[tuple[int, int, int, bytes], RecordedTable](), list[Recorded]()
     for signal in signals:
         rows, step = np.flatnonzero(np.isfinite(signal.early)), 1
         if len(rows) > 2 and (rows[-1] - rows[0]) >= len(rows):
@@ -283,8 +283,8 @@ def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded
                 if key not in tables:
                     tables[key] = signal.table.select_rows(signal.column, step, first)
                 signal = replace(signal, table=tables[key], stated_hz=(signal.rate_hz or rate_hz) / step)
-        found.append(signal)
-    return found
+        separated.append(signal)
+    return separated
 
 
 def _fit_line(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
@@ -318,9 +318,9 @@ def _read_source(source: Source, entries: Sequence[Entry]) -> Pieces:
         if source.pieces is not None:
             yield from map(_stack_columns, source.pieces([entries[column] for column in columns]))
             return
-        found = [whole(columns[0])[0], *(whole(column)[1] for column in columns)]
-        for begin in range(0, len(found[0]), _PART):
-            yield np.column_stack([each[begin : begin + _PART] for each in found])
+        arrays = [whole(columns[0])[0], *(whole(column)[1] for column in columns)]
+        for begin in range(0, len(arrays[0]), _PART):
+            yield np.column_stack([each[begin : begin + _PART] for each in arrays])
 
     return pieces
 
@@ -341,16 +341,16 @@ def _spool(values: np.ndarray) -> np.ndarray:
 
 
 def _open_recording(path: Path) -> list[Recorded]:
-    recording, found = Recording.open(path), list[Recorded]()
+    recording, signals = Recording.open(path), list[Recorded]()
     for group in recording.table.groups.values():
         stream = recording.streams.get(sensor_key(group.name))
         if stream is not None and stream.rows:
             rate_hz = next(recording.blocks(sensor_key(group.name))).rate_hz
             table = RecordedTable(stream.rows, len(group.channels), _read_recording(recording, group))
-            found += [Recorded(each.name, each.unit, table, n, rate_hz) for n, each in enumerate(group.channels)]
-    if not found:
+            signals += [Recorded(each.name, each.unit, table, n, rate_hz) for n, each in enumerate(group.channels)]
+    if not signals:
         raise InputError("FILE", "a recording with samples", str(path))
-    return found
+    return signals
 
 
 def _read_recording(recording: Recording, group: Group) -> Pieces:

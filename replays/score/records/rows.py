@@ -30,22 +30,22 @@ _MIN_RUN = 16
 
 def row_hashes(counts: np.ndarray) -> np.ndarray:
     """Return a nearly unique number of each row, uint64, shape (n,), from counts, int64, shape (n, channels)."""
-    found = np.zeros(len(counts), dtype=np.uint64)
+    hashes = np.zeros(len(counts), dtype=np.uint64)
     for c in range(counts.shape[1]):
         # splitmix64 (Steele, Lea & Flood 2014), with the column as its step.
         z = counts[:, c].astype(np.int64).view(np.uint64) + np.uint64((c + 1) * 0x9E3779B97F4A7C15 % (1 << 64))
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        found += z ^ (z >> np.uint64(31))
-    return found
+        hashes += z ^ (z >> np.uint64(31))
+    return hashes
 
 
 def group_hashes(hashes: np.ndarray, step: int = 1) -> np.ndarray:
     """Return a number of each row together with the next ones at a step; the last rows have fewer."""
-    found = hashes.copy()
+    sums = hashes.copy()
     for n in range(1, _GROUP_ROWS):
-        found[: -n * step] += hashes[n * step :] * np.uint64(2 * n + 1) ^ np.uint64(n)
-    return found
+        sums[: -n * step] += hashes[n * step :] * np.uint64(2 * n + 1) ^ np.uint64(n)
+    return sums
 
 
 def repeated_part(counts: np.ndarray) -> float:
@@ -70,13 +70,13 @@ def take_rows(pieces: Iterable[np.ndarray], first: int, rows: int, columns: int)
         rows: Number of rows that are taken, at most.
         columns: Number of columns.
     """
-    found, at = [np.empty((0, columns), dtype=np.int64)], 0
+    parts, at = [np.empty((0, columns), dtype=np.int64)], 0
     for piece in pieces:
-        found.append(piece[max(0, first - at) : max(0, first + rows - at)])
+        parts.append(piece[max(0, first - at) : max(0, first + rows - at)])
         at += len(piece)
         if at >= first + rows:
             break
-    return np.concatenate(found)
+    return np.concatenate(parts)
 
 
 class Stretches:
@@ -101,9 +101,9 @@ class Stretches:
 
     def pairs(self) -> np.ndarray:
         """Return the first and last row of each stretch, shape (n, 2)."""
-        found = np.concatenate([*self._parts, np.empty((0, 2), dtype=np.int64)])
-        begins = np.append(True, found[1:, 0] != found[:-1, 1] + 1)[: len(found)]
-        return np.column_stack([found[begins, 0], found[np.append(begins[1:], True)[: len(found)], 1]])
+        pairs = np.concatenate([*self._parts, np.empty((0, 2), dtype=np.int64)])
+        begins = np.append(True, pairs[1:, 0] != pairs[:-1, 1] + 1)[: len(pairs)]
+        return np.column_stack([pairs[begins, 0], pairs[np.append(begins[1:], True)[: len(pairs)], 1]])
 
 
 def stretches(places: np.ndarray) -> np.ndarray:
@@ -195,14 +195,14 @@ def follow(
         Place of each recorded row among those sent, -1 for a foreign one, shape (n,), chunk by chunk; and the results
         up to there, whose arrays are complete with the last chunk, which has no rows.
     """
-    window, found = _Sent(sent, np.arange(sound)), Followed()
+    window, result = _Sent(sent, np.arange(sound)), Followed()
     events: dict[str, list[np.ndarray]] = {"doubled": [], "swapped": [], "foreign": []}
     due, highest = start, -1
     for place in range(0, start - _SEARCH_BACK, 1 << 18):
         window.read_range(place, place + (1 << 18))
     for chunk in recorded:
-        found.altered = found.altered or [Stretches(_MAX_STRETCHES) for _ in range(chunk.shape[1])]
-        before = np.array([each.rows for each in found.altered])
+        result.altered = result.altered or [Stretches(_MAX_STRETCHES) for _ in range(chunk.shape[1])]
+        before = np.array([each.rows for each in result.altered])
         hashes = row_hashes(chunk[:, window.by])
         places = np.empty(len(chunk), dtype=np.int64)
         at, low = 0, due - _SEARCH_BACK
@@ -217,23 +217,23 @@ def follow(
                 part = slice(at, at + _PART)
                 places[part] = _search_places(window, hashes[part], due, low)
                 at = min(at + _PART, len(chunk))
-                known = places[part][places[part] >= 0]
-                due = int(known[-1]) + 1 if len(known) else due + at - part.start
-        highest = _count_events(found, events, places, chunk, window, highest)
-        wrong = np.array([each.rows for each in found.altered]) - before
+                identified = places[part][places[part] >= 0]
+                due = int(identified[-1]) + 1 if len(identified) else due + at - part.start
+        highest = _count_events(result, events, places, chunk, window, highest)
+        wrong = np.array([each.rows for each in result.altered]) - before
         by = np.flatnonzero(wrong[:sound] < _MAX_ALTERED_PART * len(chunk))
         window.set_columns(by if len(by) else np.arange(sound))
-        yield places, found
+        yield places, result
     while not window.ended:
         window.read_range(window.end, window.end + 1)
     window.absent.add(np.flatnonzero(window.times == 0) + window.start)
-    found.sent = window.end
+    result.sent = window.end
     lost = window.absent.pairs()
-    found.lost = lost[(lost[:, 0] > found.first) & (lost[:, 1] < found.last)]
+    result.lost = lost[(lost[:, 0] > result.first) & (lost[:, 1] < result.last)]
     for name, parts in events.items():
         if parts:
-            setattr(found, name, np.concatenate(parts))
-    yield np.empty(0, dtype=np.int64), found
+            setattr(result, name, np.concatenate(parts))
+    yield np.empty(0, dtype=np.int64), result
 
 
 def _search_places(window: _Sent, hashes: np.ndarray, due: int, low: int) -> np.ndarray:
@@ -242,11 +242,11 @@ def _search_places(window: _Sent, hashes: np.ndarray, due: int, low: int) -> np.
     while True:
         high = due + len(hashes) + ahead
         window.read_range(low, high)
-        places, known = _find_places(window, hashes, due, max(low, due - _SEARCH_BACK), high)
-        found = np.flatnonzero(places >= 0)
-        inside = len(found) and places[found[-1]] + len(hashes) - found[-1] <= high
+        places, alone = _find_places(window, hashes, due, max(low, due - _SEARCH_BACK), high)
+        placed = np.flatnonzero(places >= 0)
+        inside = len(placed) and places[placed[-1]] + len(hashes) - placed[-1] <= high
         ended = window.ended and high >= window.end
-        if (inside and known[-len(hashes) // 2 :].mean() > 0.5) or ended or ahead >= _MAX_SEARCH_AHEAD:
+        if (inside and alone[-len(hashes) // 2 :].mean() > 0.5) or ended or ahead >= _MAX_SEARCH_AHEAD:
             return places
         ahead *= 8
 
@@ -273,10 +273,10 @@ def _find_places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: in
             ranks = {"order": order, "ordered": ordered, "left": left, "right": right}
     if window.ended and end == window.end:
         _forget_chance_places(places, due, end)
-    known = places >= 0
-    open_ = np.flatnonzero(~known)
-    behind = np.maximum.accumulate(np.where(known, rows, -1))[open_]
-    next_ = np.minimum.accumulate(np.where(known, rows, n)[::-1])[::-1][open_]
+    identified = places >= 0
+    open_ = np.flatnonzero(~identified)
+    behind = np.maximum.accumulate(np.where(identified, rows, -1))[open_]
+    next_ = np.minimum.accumulate(np.where(identified, rows, n)[::-1])[::-1][open_]
     forward = np.where(behind >= 0, places[behind] + open_ - behind, due + open_)
     backward = np.where(next_ < n, places[np.minimum(next_, n - 1)] - (next_ - open_), -1)
     for guess in (forward, backward):
@@ -288,7 +288,7 @@ def _find_places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: in
     if window.ended and end == window.end:  # rows after the last one are not those of earlier periods
         left = left[forward[left] < end]
     if len(left):
-        if not known.any():  # a periodic signal: all rows follow the first one
+        if not identified.any():  # a periodic signal: all rows follow the first one
             _place_nearest(places, open_[left[:1]], forward[left[:1]], ranks, start)
             forward[left] += max(0, places[open_[left[0]]] - forward[left[0]])
         _place_nearest(places, open_[left], forward[left], ranks, start)
@@ -297,7 +297,7 @@ def _find_places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: in
     stop = np.where(next_[left] < n, places[np.minimum(next_[left], n - 1)], end)
     fits = (forward[left] < stop) & (forward[left] < end)
     places[open_[left[fits]]] = forward[left[fits]]
-    return places, known
+    return places, identified
 
 
 def _forget_chance_places(places: np.ndarray, due: int, end: int) -> None:
@@ -323,25 +323,25 @@ def _place_nearest(places: np.ndarray, rows: np.ndarray, guess: np.ndarray, rank
     ordered = ranks["ordered"]
     group = np.cumsum(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
     whole = group * (len(order) + 1) + order
-    found = np.searchsorted(whole, group[left] * (len(order) + 1) + np.clip(guess, 0, len(order)))
-    low, high = np.clip(found - 1, left, right - 1), np.clip(found, left, right - 1)
+    rank = np.searchsorted(whole, group[left] * (len(order) + 1) + np.clip(guess, 0, len(order)))
+    low, high = np.clip(rank - 1, left, right - 1), np.clip(rank, left, right - 1)
     nearer = np.abs(order[low] - guess) < np.abs(order[high] - guess)
     places[rows] = np.where(nearer, order[low], order[high]) + start
 
 
 def _count_events(
-    found: Followed, events: dict[str, list[np.ndarray]], places: np.ndarray, counts: np.ndarray, window: _Sent,
+    result: Followed, events: dict[str, list[np.ndarray]], places: np.ndarray, counts: np.ndarray, window: _Sent,
     highest: int,
 ) -> int:  # fmt: skip
     """Count the events of a chunk; return the latest place of all."""
-    numbers = found.recorded + np.arange(len(places))
-    found.recorded += len(places)
+    numbers = result.recorded + np.arange(len(places))
+    result.recorded += len(places)
     real = places >= 0
     events["foreign"].append(numbers[~real])
     came, numbers, counts = places[real], numbers[real], counts[real]
     if not len(came):
         return highest
-    found.last_row = int(numbers[-1])
+    result.last_row = int(numbers[-1])
     near, there = came - window.start, window.times
     tops = np.maximum.accumulate(np.concatenate([[highest], came]))
     if (np.diff(tops) > 0).all():  # ascending: neither doubled nor swapped
@@ -354,8 +354,8 @@ def _count_events(
         late = (came < tops[:-1]) & ~again
         events["swapped"].append(np.column_stack([came, numbers])[late])
         there[near] = 1
-    for column, known in enumerate((window.counts[near] != counts).T):
-        found.altered[column].add(came[known])
-    found.first = int(came.min()) if found.first < 0 else min(found.first, int(came.min()))
-    found.last = max(found.last, int(came.max()))
+    for column, wrong in enumerate((window.counts[near] != counts).T):
+        result.altered[column].add(came[wrong])
+    result.first = int(came.min()) if result.first < 0 else min(result.first, int(came.min()))
+    result.last = max(result.last, int(came.max()))
     return int(tops[-1])

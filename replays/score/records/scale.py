@@ -71,9 +71,9 @@ class Scale:
 
     def counts(self, values: np.ndarray) -> np.ndarray:
         """Return the counts of values, int64, shape (n,); `NO_COUNT` if a value is not a count."""
-        found = (values - self.zero) / self.each
-        whole = np.rint(found)
-        good = np.isfinite(found) & (np.abs(found - whole) <= _COUNT_TOLERANCE) & (np.abs(whole) < 2.0**53)
+        exact = (values - self.zero) / self.each
+        whole = np.rint(exact)
+        good = np.isfinite(exact) & (np.abs(exact - whole) <= _COUNT_TOLERANCE) & (np.abs(whole) < 2.0**53)
         return np.where(good, np.where(good, whole, 0.0).astype(np.int64), NO_COUNT)
 
 
@@ -86,14 +86,14 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
         counts: Counts of the same rows, provided that none is lost, shape (n,).
         channel: The channel.
     """
-    known, found = scales(unit, channel, values, counts), list[tuple[bool, float, Scale]]()
-    for form in dict.fromkeys((scale.rounding, scale.lost_bits) for scale in known):
-        alike = [scale for scale in known if (scale.rounding, scale.lost_bits) == form]
+    options, fits = scales(unit, channel, values, counts), list[tuple[bool, float, Scale]]()
+    for form in dict.fromkeys((scale.rounding, scale.lost_bits) for scale in options):
+        alike = [scale for scale in options if (scale.rounding, scale.lost_bits) == form]
         if (scale := _fit_scale(values, alike[0].sent(counts), alike)) is not None:
-            found.append((scale.clean, float(np.mean(scale.counts(values) == scale.sent(counts))), scale))
-            if found[-1][0] and not scale.rounding:
+            fits.append((scale.clean, float(np.mean(scale.counts(values) == scale.sent(counts))), scale))
+            if fits[-1][0] and not scale.rounding:
                 break
-    return max(found, key=lambda each: each[:2])[2] if found else None
+    return max(fits, key=lambda each: each[:2])[2] if fits else None
 
 
 def _fit_scale(values: np.ndarray, counts: np.ndarray, candidates: list[Scale]) -> Scale | None:
@@ -151,10 +151,10 @@ def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates
     slope = fit_line(x, off).slope
     alone = float(off @ x / (x @ x)) if x.any() else 0.0
     forms = ((0.0, 0.0), (alone, 0.0), (0.0, float(off.mean())), (slope, float(off.mean()) - slope * mean))
-    left = [float(np.sqrt(np.mean((off - gain * x - zero) ** 2))) for gain, zero in forms]
+    errors = [float(np.sqrt(np.mean((off - gain * x - zero) ** 2))) for gain, zero in forms]
     # 64-bit rounding, and a tenth more than the least.
-    enough = max(1.1 * left[-1], 1e-14 * (float(np.abs(x).max()) + abs(near.zero / near.each)))
-    gain, zero = next(form for form, each in zip(forms, left, strict=True) if each <= enough)
+    enough = max(1.1 * errors[-1], 1e-14 * (float(np.abs(x).max()) + abs(near.zero / near.each)))
+    gain, zero = next(form for form, each in zip(forms, errors, strict=True) if each <= enough)
     if (gain, zero) == (0.0, 0.0):
         return (
             near
@@ -178,22 +178,22 @@ def scales(unit: str, channel: Channel, values: np.ndarray, counts: np.ndarray) 
         counts: Some of the counts that were sent, shape (m,).
     """
     has_unit, kind, bits = units.canonical(unit) != "1", units.get_quantity(unit), channel.adc_bits
-    found = [Scale(1.0, 0.0, "counts")] if kind == "" or not has_unit else []
+    options = [Scale(1.0, 0.0, "counts")] if kind == "" or not has_unit else []
     if not has_unit or kind == units.get_quantity(channel.unit):
         size = units.size_si(channel.unit) / units.size_si(unit) if has_unit else 1.0
-        found.append(Scale(channel.scale * size, channel.offset * size, channel.unit))
+        options.append(Scale(channel.scale * size, channel.offset * size, channel.unit))
     if not has_unit or kind == "voltage":
-        found.append(Scale(channel.lsb_v / (units.size_si(unit) if has_unit else 1.0), 0.0, "V"))
+        options.append(Scale(channel.lsb_v / (units.size_si(unit) if has_unit else 1.0), 0.0, "V"))
     if not has_unit:
-        found.append(Scale(2.0 ** (1 - bits), 0.0, "fractions of full scale"))
-        found += [Scale(2.0 ** (32 - bits), 0.0, "counts at the upper end of 32 bits")] if bits < 32 else []
-    found = found or [Scale(1.0, 0.0, "counts")]
+        options.append(Scale(2.0 ** (1 - bits), 0.0, "fractions of full scale"))
+        options += [Scale(2.0 ** (32 - bits), 0.0, "counts at the upper end of 32 bits")] if bits < 32 else []
+    options = options or [Scale(1.0, 0.0, "counts")]
     values = values[np.isfinite(values)]
     if not len(values) or not np.ptp(values) or not np.ptp(counts):
-        return found
+        return options
     moving = values[values != np.median(values)]
     moving = moving[:: 1 + len(moving) // _BITS_ROWS]
-    for scale in found[:]:
+    for scale in options[:]:
         lost = _lost_bits((moving - scale.zero) / scale.each, bits - _MIN_BITS)
         coarse = {(lost, 2.0**lost)} if lost else set[tuple[int, float]]()
         if scale.what == "counts" and (moving == np.rint(moving)).all():
@@ -201,13 +201,13 @@ def scales(unit: str, channel: Channel, values: np.ndarray, counts: np.ndarray) 
             coarse |= {(n, 1.0) for n in (near, near + 1, near - 1) if 0 < n <= bits - _MIN_BITS}
         ways = [(way, *each) for way in ("down", "nearest", "nearest even") for each in sorted(coarse)]
         ways += [("full scale", lost, 2.0**lost)] if scale.what in ("V", "fractions of full scale") else []
-        found += [
+        options += [
             replace(
                 scale, each=scale.each * size, what=f"{scale.what}, {bits - n} bits, rounded {way}", bits=bits - n,
                 lost_bits=n, rounding=way,
             ) for way, n, size in ways
         ]  # fmt: skip
-    return found
+    return options
 
 
 def _lost_bits(numbers: np.ndarray, most: int) -> int:

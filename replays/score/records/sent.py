@@ -95,7 +95,7 @@ class Session:
 
     def arrived_s(self, groups: Sequence[str], times_s: np.ndarray) -> np.ndarray:
         """Return the arrival times of rows of all of some groups, by their blocks [unix s], shape (n,)."""
-        found = []
+        arrivals_s = []
         for group in groups:
             if group not in self._blocks:
                 key, of = sensor_key(group), self.recording.everything()
@@ -103,8 +103,8 @@ class Session:
             begins_s, wall_s = self._blocks[group]
             # The rounding of a row's time differs from that of its block's time.
             at = np.searchsorted(begins_s, times_s + 0.5 / self.rate_hz(group), side="right") - 1
-            found.append(wall_s[np.maximum(at, 0)])
-        return np.max(found, axis=0)
+            arrivals_s.append(wall_s[np.maximum(at, 0)])
+        return np.max(arrivals_s, axis=0)
 
     @property
     def noisy(self) -> bool:

@@ -92,7 +92,7 @@ def remove_noise(values: np.ndarray, noise: float) -> np.ndarray:
     from scipy.ndimage import uniform_filter
     from scipy.signal import istft, stft
 
-    found = np.array(values, float)
+    cleaned = np.array(values, float)
     options: dict[str, Any] = {"nperseg": _SEGMENT, "noverlap": 3 * _SEGMENT // 4}
     for begin in range(0, len(values) if len(values) > 2 * _SEGMENT else 0, _CHUNK):
         low, high = max(0, begin - _SEGMENT), min(len(values), begin + _CHUNK + _SEGMENT)
@@ -102,8 +102,8 @@ def remove_noise(values: np.ndarray, noise: float) -> np.ndarray:
         level = noise**2 * 1.5 / _SEGMENT
         spectra[uniform_filter(np.abs(spectra) ** 2, 3) < _MIN_SIGNAL_TO_NOISE * level] = 0.0
         part = istft(spectra, **options)[1][begin - low : high - low] + middle
-        found[begin : begin + _CHUNK] = part[: len(found[begin : begin + _CHUNK])]
-    return found
+        cleaned[begin : begin + _CHUNK] = part[: len(cleaned[begin : begin + _CHUNK])]
+    return cleaned
 
 
 def split_at_rate(

@@ -101,18 +101,18 @@ def find_wires(
     wires = best
     more = _find(recorded, here[1], _busiest_s(recorded, found_s, short), short)
     more = {name: _shift(wire, here[0]) for name, wire in more.items()}
-    alike = [sum(wire.likeness for wire in found.values()) for found in (wires, more)]
+    alike = [sum(wire.likeness for wire in merged.values()) for merged in (wires, more)]
     first, second = (more, wires) if alike[1] > alike[0] else (wires, more)
-    found = {}
+    merged = {}
     for name, wire in first.items():
         other = second[name]
         # Clocks that differ blur fast signals over the long stretch, and a slower channel then correlates better.
         of = max(wire, other, key=lambda each: each.likeness)
-        found[name] = replace(
+        merged[name] = replace(
             of, offset_s=wire.offset_s, own_s=wire.own_s, within_s=wire.within_s,
             others_s=(other.offset_s, *other.others_s, *wire.others_s),
         )  # fmt: skip
-    return found
+    return merged
 
 
 def _sum_likeness(wires: Mapping[str, Wire]) -> float:
@@ -157,12 +157,12 @@ def _find(
     rate = min(rate, _MAX_SAMPLES / taken_s, 8.0 * _MAX_SAMPLES / length)
     behind = math.ceil(taken_s * rate) // 2
     there, even = _find_spectra(sent, rate, length, math.ceil((length + taken_s) * rate))
-    taken = {name: _resample(values, each, rate, taken_s) for name, (values, each) in recorded.items()}
-    lengths = {n: _stretch_norms(even, behind, n) for n in {len(here) for here in taken.values()}}
-    names, found = list(sent), {}
+    resampled = {name: _resample(values, each, rate, taken_s) for name, (values, each) in recorded.items()}
+    lengths = {n: _stretch_norms(even, behind, n) for n in {len(here) for here in resampled.values()}}
+    names, wires = list(sent), {}
     best: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     ends: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for name, here in taken.items():
+    for name, here in resampled.items():
         length = lengths[len(here)] / math.sqrt(_upsampling_factor(recorded[name][1], rate))
         curve = _correlate(here, behind, there, length)
         alike = np.abs(curve).max(axis=0)
@@ -171,8 +171,8 @@ def _find(
         ends[name] = curve.min(axis=1), curve.max(axis=1)
     lags = _find_common_lags(list(best.values()), behind + round(from_s * rate))
     lag = lags[0]
-    padded = np.pad(even, ((0, 0), (behind, max(map(len, taken.values())) + round(_WIDE_S * rate) + _REACH)))
-    for name, here in taken.items():
+    padded = np.pad(even, ((0, 0), (behind, max(map(len, resampled.values())) + round(_WIDE_S * rate) + _REACH)))
+    for name, here in resampled.items():
         length = lengths[len(here)] / math.sqrt(_upsampling_factor(recorded[name][1], rate))
         for apart in (_REACH, round(_WIDE_S * rate)):
             first = max(0, min(lag, length.shape[1] - 1) - apart)  # nothing was found, late in the recording
@@ -192,21 +192,21 @@ def _find(
         peak = near[k][at]
         polarity = 1 if peak >= 0.0 else -1
         ambiguous = max(-polarity * end[k] for end in ends[name]) > 0.9 * amounts[k]
-        known = amounts[k] > max(_LIMIT, _CHANCE / math.sqrt(len(here) / _upsampling_factor(recorded[name][1], rate)))
+        clear = amounts[k] > max(_LIMIT, _CHANCE / math.sqrt(len(here) / _upsampling_factor(recorded[name][1], rate)))
         offset_s = (lag - behind) / rate - from_s
-        found[name] = Wire(
-            names[k] if known else "", polarity, float(amounts[k]), rivals if known else (), bool(ambiguous),
+        wires[name] = Wire(
+            names[k] if clear else "", polarity, float(amounts[k]), rivals if clear else (), bool(ambiguous),
             offset_s, (from_s, from_s + taken_s), tuple((each - behind) / rate - from_s for each in lags[1:]),
             offset_s if ambiguous else offset_s + (first + at - lag) / rate,
         )  # fmt: skip
     # Among equally similar channels, prefer one whose name no other signal has.
-    taken = {name for name, wire in found.items() if wire.channel == name}
-    for name, wire in found.items():
-        free = [each for each in (wire.channel, *wire.rivals) if each not in taken]
-        if wire.channel in taken - {name} and free:
+    resampled = {name for name, wire in wires.items() if wire.channel == name}
+    for name, wire in wires.items():
+        free = [each for each in (wire.channel, *wire.rivals) if each not in resampled]
+        if wire.channel in resampled - {name} and free:
             rivals = (wire.channel, *(each for each in wire.rivals if each != free[0]))
-            found[name] = replace(wire, channel=free[0], rivals=rivals)
-    return found
+            wires[name] = replace(wire, channel=free[0], rivals=rivals)
+    return wires
 
 
 def _resample(values: np.ndarray, rate: float, wanted: float, seconds: float) -> np.ndarray:

@@ -43,10 +43,10 @@ _QUICK_PEERS = 3
 
 def competitors(*, peers: bool = True) -> dict[str, Competitor]:
     """Return our engines and the installed peers by name."""
-    found = {name: _engine(name) for name in ENGINES}
+    methods = {name: _engine(name) for name in ENGINES}
     if peers:
-        found |= {name: _peer(name) for name, peer in PEERS.items() if peer.installed}
-    return found
+        methods |= {name: _peer(name) for name, peer in PEERS.items() if peer.installed}
+    return methods
 
 
 def missing_peers() -> list[str]:

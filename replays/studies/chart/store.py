@@ -129,11 +129,11 @@ def code_digest() -> str:
 
 def stamp() -> dict[str, str]:
     """Return the provenance of a point: code, commit, date, machine, versions of libraries."""
-    found = {"Python": platform.python_version(), **provenance.versions(*_LIBRARIES)}
+    library_versions = {"Python": platform.python_version(), **provenance.versions(*_LIBRARIES)}
     return {
         "code": code_digest(),
         "commit": provenance.commit(),
         "date": provenance.today(),
         "machine": provenance.machine(),
-        "versions": ", ".join(f"{name} {version}" for name, version in found.items()),
+        "versions": ", ".join(f"{name} {version}" for name, version in library_versions.items()),
     }

@@ -41,8 +41,8 @@ def digest(sources: Iterable[Path]) -> str:
 def _fields(node: object) -> object:
     """Convert a syntax tree to tuples without empty fields, since `ast.dump` differs between versions of Python."""
     if isinstance(node, ast.AST):
-        found = ((name, _fields(value)) for name, value in ast.iter_fields(node) if value not in (None, []))
-        return (type(node).__name__, *found)
+        fields = ((name, _fields(value)) for name, value in ast.iter_fields(node) if value not in (None, []))
+        return (type(node).__name__, *fields)
     return tuple(map(_fields, node)) if isinstance(node, list) else node
 
 
@@ -79,10 +79,10 @@ def machine() -> str:
 
 def versions(*libraries: str) -> dict[str, str]:
     """Return the versions of those libraries that are installed."""
-    found = {}
+    installed = {}
     for library in libraries:
         try:
-            found[library] = version(library)
+            installed[library] = version(library)
         except PackageNotFoundError:
             continue
-    return found
+    return installed

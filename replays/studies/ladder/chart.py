@@ -92,10 +92,10 @@ def _draw_levels(axes: Any, ladder: Ladder, levels: list[Rung], name: str, *, na
         axes.plot(place, row, marker=marker, ms=8, color=colour, mec="white", ls="none", zorder=3)
         text = "0" if error == 0.0 else f"{error:.1e}".replace("e-0", "e-").replace("e+00", "")
         text = text if math.isfinite(error) else "cannot give it"
-        left = place > math.sqrt(low * high)
+        on_left = place > math.sqrt(low * high)
         axes.annotate(
-            text, (place, row), xytext=(-8 if left else 8, 0), textcoords="offset points", va="center",
-            ha="right" if left else "left", fontsize=9, bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 0.6},
+            text, (place, row), xytext=(-8 if on_left else 8, 0), textcoords="offset points", va="center",
+            ha="right" if on_left else "left", fontsize=9, bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 0.6},
         )  # fmt: skip
     axes.set_ylim(len(levels) - 0.4, -0.6)
     labels = [_row_label(step) for step in levels] if named else [""] * len(levels)
@@ -195,10 +195,10 @@ def _write_evidence(axes: Any, ladder: Ladder) -> None:
 def _caption(ladder: Ladder) -> str:
     """Return the caption: reference, costs and environment."""
     names = ", ".join(name.replace("_", " ") for name in ladder.tolerances)
-    pick, given, full = (run.cpu_s * 1e3 for run in (ladder.picked, ladder.given, ladder.full))
+    pick, own, full = (run.cpu_s * 1e3 for run in (ladder.picked, ladder.given, ladder.full))
     text = (
         f"Processor times are medians as it will run, sensors {ladder.sensors}, lines from least to largest: the pick "
-        f"takes {pick:.3g} ms; with the scene's sensors the scene as given {given:.3g} ms, the full model {full:.3g} "
+        f"takes {pick:.3g} ms; with the scene's sensors the scene as given {own:.3g} ms, the full model {full:.3g} "
         f"ms by {ladder.full.candidate.label}. Errors of {names} against the full model by "
         f"{ladder.reference.candidate.label}, whose own error is its distance to "
         f"{ladder.unlike.candidate.label}. * with a remark in the table. Seed "

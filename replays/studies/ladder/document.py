@@ -71,7 +71,7 @@ def make_pick(ladder: Ladder) -> Pick:
     scene, picked, errors = ladder.scene, ladder.picked, ladder.picked_errors
     candidate = picked.candidate
     scene_digest, parameters_digest, code_digest = pick_digests(scene)
-    found = versions()
+    environment = versions()
     return Pick(
         **candidate.levels.model_dump(),
         drive=candidate.drive,  # pyrefly: ignore[bad-argument-type]
@@ -99,10 +99,10 @@ def make_pick(ladder: Ladder) -> Pick:
         cpu_full_s=_digits(ladder.full.cpu_s),
         reference_engine=ladder.reference.candidate.method,
         unlike_engine=ladder.unlike.candidate.method,
-        date=found["date"],
-        rig=found["rig"],
-        commit=found["commit"],
-        machine=found["machine"],
+        date=environment["date"],
+        rig=environment["rig"],
+        commit=environment["commit"],
+        machine=environment["machine"],
         seed=scene.seed,
         scene_digest=scene_digest,
         parameters_digest=parameters_digest,
@@ -112,14 +112,14 @@ def make_pick(ladder: Ladder) -> Pick:
 
 def versions() -> dict[str, str]:
     """Return date, machine, commit, and the versions that affect the numbers."""
-    found = provenance.versions(provenance.RIG, *_PACKAGES)
+    environment = provenance.versions(provenance.RIG, *_PACKAGES)
     return {
         "date": provenance.today(),
-        "rig": found.pop(provenance.RIG),
+        "rig": environment.pop(provenance.RIG),
         "commit": provenance.commit(),
         "machine": provenance.machine(),
         "python": platform.python_version(),
-        **found,
+        **environment,
     }
 
 
@@ -160,7 +160,7 @@ def _short(value: Value) -> Value:
 
 def python_line() -> str:
     """Return the environment on one line, for the chart."""
-    found = versions()
-    packages = ", ".join(f"{name} {found[name]}" for name in _PACKAGES)
-    commit = f", commit {found['commit']}" if found["commit"] else ""
-    return f"rig {found['rig']}{commit}, {found['date']}; {found['machine']}; Python {found['python']}, {packages}"
+    at = versions()
+    packages = ", ".join(f"{name} {at[name]}" for name in _PACKAGES)
+    commit = f", commit {at['commit']}" if at["commit"] else ""
+    return f"rig {at['rig']}{commit}, {at['date']}; {at['machine']}; Python {at['python']}, {packages}"

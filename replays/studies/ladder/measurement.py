@@ -261,8 +261,8 @@ def first_impact(scene: Scene, candidate: Candidate) -> float:
         touched = np.flatnonzero((gap >= 0.0) | (rows[:, COLUMN["contact_impulse"]] > 0.0))
         hit = int(touched[0]) if len(touched) else len(rows)
         if len(touched) or simulation.health()["contacts"]:
-            known = rows[:hit] if last is None else np.concatenate([last[None], rows[:hit]])
-            return _find_crossing(known, start + (hit - 1) * simulation.row_ticks, simulation.row_ticks)
+            table = rows[:hit] if last is None else np.concatenate([last[None], rows[:hit]])
+            return _find_crossing(table, start + (hit - 1) * simulation.row_ticks, simulation.row_ticks)
         last = rows[-1].copy()
     return math.nan
 

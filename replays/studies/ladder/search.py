@@ -152,7 +152,7 @@ def search(
             picked = _select_cheapest(work, passing)
         else:
             break
-    given = work.run(settings.own_candidate(scene), sensors={})
+    scene_run = work.run(settings.own_candidate(scene), sensors={})
     setting = settings.own_setting(scene, standard.full, settings.REFERENCE[0])
     full = work.run(standard.full.with_engine(*setting), sensors={})
     own = _run_as_given(work, standard)
@@ -168,8 +168,8 @@ def search(
         picked=picked.measured,
         picked_errors=picked.errors,
         savings=savings,
-        given=given,
-        given_errors=standard.compare(given.values, standard.reference.values),
+        given=scene_run,
+        given_errors=standard.compare(scene_run.values, standard.reference.values),
         full=full,
         sensors=chain,
         spent_s=work.spent_s,

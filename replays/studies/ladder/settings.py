@@ -50,18 +50,18 @@ def own_candidate(scene: Scene) -> Candidate:
 
 def list_settings(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float]]]:
     """Return steps and tolerances, finest first, of every engine that supports a model and fits the sample rates."""
-    found: dict[str, list[tuple[int, float]]] = {}
+    settings: dict[str, list[tuple[int, float]]] = {}
     for engine, method in ENGINES.items():
         if not supports(engine, candidate):
             continue
         if method.tolerance:
             grids = [step for step in _GRIDS if step <= method.step_us and _fits(scene, candidate, engine, step)]
             scales = (1e-2, 1.0, 1e2)
-            found[engine] = [(grids[0], method.tolerance * scale) for scale in scales] if grids else []
+            settings[engine] = [(grids[0], method.tolerance * scale) for scale in scales] if grids else []
         else:
             steps = [step for step in _STEPS if 0.2 * method.step_us <= step <= 4.0 * method.step_us]
-            found[engine] = [(step, 0.0) for step in steps if _fits(scene, candidate, engine, step)]
-    return found
+            settings[engine] = [(step, 0.0) for step in steps if _fits(scene, candidate, engine, step)]
+    return settings
 
 
 def _fits(scene: Scene, candidate: Candidate, engine: str, step_us: int) -> bool:

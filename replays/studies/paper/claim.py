@@ -137,21 +137,21 @@ def bars(results: Results, quantity: str) -> list[Bar]:
     def get(group: str) -> float:
         return median(results[group], quantity)
 
-    found = [
+    chart = [
         Bar(entry.called, "assumed value", (get(f"low {entry.key}"), base, get(f"high {entry.key}")))
         for entry in free_values()
     ]
-    found += [Bar(CORRECTIONS[key], "correction", (printed, get(f"correction {key}"))) for key in correction_keys()]
-    found.append(Bar("all corrections", "correction", (printed, base)))
-    found.append(Bar("supports, 1/10 to 10 times as stiff", "housing", (get("mobility 0.1"), base, get("mobility 10"))))
-    found += [Bar(name, "other reading", (base, get(f"alternative {name}"))) for name in alternatives()]
-    found.append(Bar("contact law", "other reading", tuple(get(f"law {law}") for law in LAWS)))
-    return sorted(found, key=lambda bar: -bar.width)
+    chart += [Bar(CORRECTIONS[key], "correction", (printed, get(f"correction {key}"))) for key in correction_keys()]
+    chart.append(Bar("all corrections", "correction", (printed, base)))
+    chart.append(Bar("supports, 1/10 to 10 times as stiff", "housing", (get("mobility 0.1"), base, get("mobility 10"))))
+    chart += [Bar(name, "other reading", (base, get(f"alternative {name}"))) for name in alternatives()]
+    chart.append(Bar("contact law", "other reading", tuple(get(f"law {law}") for law in LAWS)))
+    return sorted(chart, key=lambda bar: -bar.width)
 
 
-def select_lower_ends(found: list[Bar]) -> list[Bar]:
+def select_lower_ends(chart: list[Bar]) -> list[Bar]:
     """Return the bars with an end below the last label of the measured axis."""
-    return [bar for bar in found if any(value <= MEASURED_N for value in bar.values)]
+    return [bar for bar in chart if any(value <= MEASURED_N for value in bar.values)]
 
 
 @house_style()

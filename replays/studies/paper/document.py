@@ -133,13 +133,13 @@ def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
 
 _PICTURES: dict[str, Callable[[Findings], Figure]] = {
     "verdicts": lambda findings: draw_verdicts([*findings.lines, *findings.claims]),
-    "magnets": lambda findings: figure.draw_magnets(findings.found["corrected"]),
-    "drop": lambda findings: figure.draw_drop(findings.found),
-    "hammer": lambda findings: figure.draw_hammer(findings.found),
-    "waterfall": lambda findings: figure.draw_waterfall(findings.found),
-    "reactions": lambda findings: figure.draw_reactions(findings.found),
-    "east": lambda findings: figure.draw_east(findings.found),
-    "speeds": lambda findings: figure.draw_speeds(findings.found),
+    "magnets": lambda findings: figure.draw_magnets(findings.runs_by_set["corrected"]),
+    "drop": lambda findings: figure.draw_drop(findings.runs_by_set),
+    "hammer": lambda findings: figure.draw_hammer(findings.runs_by_set),
+    "waterfall": lambda findings: figure.draw_waterfall(findings.runs_by_set),
+    "reactions": lambda findings: figure.draw_reactions(findings.runs_by_set),
+    "east": lambda findings: figure.draw_east(findings.runs_by_set),
+    "speeds": lambda findings: figure.draw_speeds(findings.runs_by_set),
     "tornado": lambda findings: draw_tornado(findings.results, findings.spread),
     "mobility": lambda findings: draw_mobility(findings.results),
     "spread": lambda findings: draw_spread(findings.parts, findings.spread),
@@ -162,19 +162,19 @@ def draw_pictures(findings: Findings, folder: Path) -> list[Path]:
 
 def _numbers(findings: Findings) -> dict[str, Any]:
     """Return the values for the template."""
-    results, found = findings.results, findings.found
+    results, reproductions = findings.results, findings.runs_by_set
     return {
         "judged_by": JUDGED_BY,
-        "found": found,
+        "runs_by_set": reproductions,
         "median": lambda group, quantity: median(results[group], quantity),
         "measured_n": MEASURED_N,
-        "resolution_hz": 2.0 / (0.5 * found["corrected"].whirl.times_s[-1]),
+        "resolution_hz": 2.0 / (0.5 * reproductions["corrected"].whirl.times_s[-1]),
         "unbalance_n": findings.constants.shaft.unbalance * (2.0 * math.pi * 6.2) ** 2,
-        "drop": open_questions.drop_numbers(found),
+        "drop": open_questions.drop_numbers(reproductions),
         **open_questions.house_numbers(results),
         "magnet": open_questions.magnet_numbers(),
         "running": open_questions.running_numbers(),
-        "clearance": open_questions.clearance_numbers(found),
+        "clearance": open_questions.clearance_numbers(reproductions),
         "tornado": {"idle_n": IDLE_N, "idle": idle_changes(findings)},
         "moves": _moves(findings),
         "mobility": {f"× {each:g}": f"mobility {each:g}" for each in SCALES} | {"rigid": "alternative rigid housing"},
@@ -223,7 +223,7 @@ def _ring_forces(findings: Findings) -> dict[str, Any]:
     """Return the force on a rigid ring in whirl by closed form [N], by drive speed [Hz], at the simulated spin."""
     constants = findings.constants
     own, closed = condition.oscillator(constants), {}
-    for speed, run in findings.found["corrected"].speeds.items():
+    for speed, run in findings.runs_by_set["corrected"].speeds.items():
         spin = float(np.mean(run["spin_rate"][run.times_s > run.times_s[-1] - 0.3]))
         closed[speed] = condition.normal_force(own, *condition.rolling_circle(constants, spin))
     rigid = median(findings.results["alternative rigid housing"], "normal_n")

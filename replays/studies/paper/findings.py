@@ -66,7 +66,7 @@ class Findings:
     """Everything that was run and measured.
 
     Attributes:
-        found: The paper's runs by parameter set.
+        runs_by_set: The paper's runs by parameter set.
         results: Outcomes of the scans by group.
         parts: Points of the hypercube, shape (samples, values).
         spread: Its outcomes with the corrected set.
@@ -80,7 +80,7 @@ class Findings:
         claims: Lines of the summary from scans.
     """
 
-    found: dict[str, Reproduction]
+    runs_by_set: dict[str, Reproduction]
     results: Results
     parts: np.ndarray
     spread: list[PulseRun]
@@ -144,7 +144,7 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
         progress: Function that receives a text for each step, `steps` times in all.
     """
     report = progress or (lambda _: None)
-    found = {name: reproduce(name, quick=quick, progress=report) for name in SETS}
+    by_set = {name: reproduce(name, quick=quick, progress=report) for name in SETS}
     groups = list_groups(quick=quick)
     pulses: list[Pulse] = [pulse for group in groups.values() for pulse in group]
     done = list(outcomes(pulses, processes=processes, progress=report))
@@ -165,7 +165,7 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
         drops[name] = drop_spread(name, 4 if quick else 40)
         report(f"drops, {name}")
     findings = Findings(
-        found=found,
+        runs_by_set=by_set,
         results=results,
         parts=hypercube(len(groups["spread corrected"]))[0],
         spread=results["spread corrected"],
@@ -180,7 +180,7 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
         name: {key: np.array([value]) for key, value in one.numbers.items()}
         | drops[name]
         | pulse_spread(*(results[f"{group} {name}"] for group in ("spread", "slow", "lasting")))
-        for name, one in found.items()
+        for name, one in by_set.items()
     }
     findings.lines = [Line(entry, {name: ours[name][entry.quantity] for name in SETS}) for entry in statements()]
     numbers = claim_numbers(findings)
@@ -194,10 +194,10 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
 
     def stiffness_ratios(houses: Iterable[str], *quantities: str) -> np.ndarray:
         """Return ratios of less mobile housings to the corrected ones in the same run; all are readings."""
-        found = []
+        numbers = []
         for each in (results[f"spread {name}"] for name in houses):
-            found += [column(each, name) / column(findings.spread[: len(each)], name) for name in quantities]
-        return np.concatenate(found)
+            numbers += [column(each, name) / column(findings.spread[: len(each)], name) for name in quantities]
+        return np.concatenate(numbers)
 
     def laws(name: str, *groups: str) -> np.ndarray:
         """Return medians with other contact laws relative to the default one."""
@@ -209,7 +209,7 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
         hypercube(len(findings.spread))[1], findings.spread[: len(results["slow corrected"])], strict=False
     ):
         both_sides.append(conditions(pulse_model(pulse, pulse.changes).constants, result.whirl_hz))
-    found = {
+    numbers = {
         "house_raises": 1.0 / stiffness_ratios(["rigid"], "reaction_x_n"),
         "house_ripple": 1.0 / stiffness_ratios(["rigid"], "ripple_n"),
         "stiff_bouncing": stiffness_ratios(stiffer_houses(), "contacts", "roll_s", "rebound_m_s"),
@@ -218,7 +218,7 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
         "law_peak": 100.0 * np.abs(laws("peak_normal_n", *other) - 1.0),
         **dict(zip(("centrifugal", "critical", "eigenfrequency"), np.array(both_sides).T, strict=True)),
     }
-    return {name: values[np.isfinite(values)] for name, values in found.items()}
+    return {name: values[np.isfinite(values)] for name, values in numbers.items()}
 
 
 def conditions(constants: Constants, whirl_hz: float) -> tuple[float, ...]:

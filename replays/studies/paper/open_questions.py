@@ -62,9 +62,9 @@ def ring_weight(constants: Constants) -> float:
     return shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring
 
 
-def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
+def drop_numbers(by_set: dict[str, Reproduction]) -> Numbers:
     """Return the numbers that compare the drop's 100 N with the change of momentum."""
-    model = found["corrected"].drop.simulation.model
+    model = by_set["corrected"].drop.simulation.model
     contact, masses = model.constants.contact, reference_impact(model.parameters)
     time_s, speed = compute_fall(model.constants)
 
@@ -83,8 +83,8 @@ def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
         "speed": speed,
         "free": free,
         "fixed": compute_impact(masses.shaft_mass),
-        "runs": {name: _drop_run(one) for name, one in found.items()},
-        "amplified": _amplification(found["corrected"].drop),
+        "runs": {name: _drop_run(one) for name, one in by_set.items()},
+        "amplified": _amplification(by_set["corrected"].drop),
         "half_sine_ms": half_sine_ms,
         "ratio": half_sine_ms / (free.duration * 1e3),
         "soft": {
@@ -214,9 +214,9 @@ class PaperAxis(NamedTuple):
     """Clearances at which the curve fills the axis and stays inside [mm]."""
 
 
-def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
+def clearance_numbers(by_set: dict[str, Reproduction]) -> Numbers:
     """Return the clearances allowed by each axis of the paper."""
-    one = found["corrected"]
+    one = by_set["corrected"]
     constants, n = one.whirl.simulation.model.constants, one.numbers
     r0 = constants.contact.clearance * 1e3
     lever = constants.shaft.arm_disk / constants.shaft.arm_ring

@@ -105,7 +105,7 @@ def drop_spread(parameters: str, samples: int) -> dict[str, np.ndarray]:
     Ambiguous statements contribute both readings: the path in the ring or at the probes, the acceleration in m/s² or in
     g, the reaction relative to its own contact force or to that of a rigid housing.
     """
-    found: dict[str, list[float]] = {}
+    readings_by_name: dict[str, list[float]] = {}
     own = load_parameters(parameters).entries
     for pulse in hypercube(samples, parameters=parameters)[1]:
         changes = {key: value for key, value in pulse.changes.items() if key in own}
@@ -115,11 +115,11 @@ def drop_spread(parameters: str, samples: int) -> dict[str, np.ndarray]:
         numbers = drop_numbers(run, bandwidth_hz=pulse.changes[BANDWIDTH])
         for name, value in numbers.items():
             readings = (value, value / G) if name.endswith("acceleration") else (value,)
-            found.setdefault(name.removesuffix("_disk"), []).extend(readings)
+            readings_by_name.setdefault(name.removesuffix("_disk"), []).extend(readings)
         south = numbers["drop_reaction"]
         contact, still = (float(each["normal_force"].max()) for each in (run, rigid))
-        found.setdefault("drop_amplified", []).extend((south / contact, south / still))
-    return {name: np.array(values) for name, values in found.items()}
+        readings_by_name.setdefault("drop_amplified", []).extend((south / contact, south / still))
+    return {name: np.array(values) for name, values in readings_by_name.items()}
 
 
 def bare_drop(changes: dict[str, Any]) -> Run:

@@ -37,20 +37,20 @@ def run_trials(trials: list[str], engines: list[str], *, quick: bool) -> Iterato
         yield from peer_cells(trial)
 
 
-def choose_names(field: str, names: str | None, known: list[str]) -> list[str]:
+def choose_names(field: str, names: str | None, choices: list[str]) -> list[str]:
     """Return the known names of a comma-separated list, in their own order; None selects all.
 
     Raises:
         InputError: If a name does not exist, or the list is empty.
     """
     if names is None:
-        return known
+        return choices
     requested = [name.strip() for name in names.split(",") if name.strip()]
-    by_lower = {name.lower(): name for name in known}
+    by_lower = {name.lower(): name for name in choices}
     for name in requested:
         if name.lower() not in by_lower:
-            raise InputError(field, f"one or more of {', '.join(known)}", name)
+            raise InputError(field, f"one or more of {', '.join(choices)}", name)
     wanted = {by_lower[name.lower()] for name in requested}
     if not wanted:
-        raise InputError(field, f"one or more of {', '.join(known)}", names)
-    return [name for name in known if name in wanted]
+        raise InputError(field, f"one or more of {', '.join(choices)}", names)
+    return [name for name in choices if name in wanted]

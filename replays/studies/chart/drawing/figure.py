@@ -111,8 +111,8 @@ def _select(rows: list[Row], panel: str, phase: str, cases: tuple[str, ...] = ()
 
 
 def _phases(rows: list[Row], panel: str) -> list[str]:
-    found = {row["phase"] for row in rows if row["panel"] == panel and row["family"] != "reference"}
-    return [phase for phase in PHASES if phase in found]
+    measured = {row["phase"] for row in rows if row["panel"] == panel and row["family"] != "reference"}
+    return [phase for phase in PHASES if phase in measured]
 
 
 def _hero(figure: Any, rows: list[Row]) -> str:

@@ -44,7 +44,7 @@ def compare(rows: list[Row], case: str) -> dict[str, Ratio]:
         rows: Points of the twelve scenes.
         case: Target.
     """
-    found: dict[str, Ratio] = {}
+    ratios: dict[str, Ratio] = {}
     for scene in TWELVE_SCENES:
         points = [row for row in rows if row["phase"] == scene and row["case"] == case]
         ours = next((row for row in points if row["method"] == _MAIN), None)
@@ -55,8 +55,8 @@ def compare(rows: list[Row], case: str) -> dict[str, Ratio]:
         speed = 0.0 if ours["failure"] else ours["speed"]
         best = max((row["speed"] for row in reached), default=0.0)
         library = max((own_speed(row) or row["speed"] for row in reached), default=0.0)
-        found[scene] = Ratio(*(speed / other if other else math.inf for other in (best, library)))
-    return found
+        ratios[scene] = Ratio(*(speed / other if other else math.inf for other in (best, library)))
+    return ratios
 
 
 def _style(row: Row, rows: list[Row]) -> dict[str, Any]:

@@ -46,14 +46,14 @@ def _time_from_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
 
 
 def _columns(
-    found: dict[str, Reproduction], title: str, height: float, *, heights: tuple[float, ...] = (1.0,)
+    by_set: dict[str, Reproduction], title: str, height: float, *, heights: tuple[float, ...] = (1.0,)
 ) -> tuple[Figure, list[tuple[Reproduction, Any]]]:
     """Return a figure with a column of panels for each parameter set, on the same scales for comparison."""
     figure = new_figure(height, title)
-    panels = figure.subplots(len(heights), len(found), squeeze=False, sharey="row", height_ratios=heights)
-    for one, axes in zip(found.values(), panels[0], strict=True):
+    panels = figure.subplots(len(heights), len(by_set), squeeze=False, sharey="row", height_ratios=heights)
+    for one, axes in zip(by_set.values(), panels[0], strict=True):
         axes.set_title(one.parameters)
-    return figure, list(zip(found.values(), panels.T, strict=True))
+    return figure, list(zip(by_set.values(), panels.T, strict=True))
 
 
 def _label_first(columns: list[tuple[Reproduction, Any]], *labels: str) -> None:
@@ -106,10 +106,10 @@ def first_impacts(penetration: np.ndarray, times_ms: np.ndarray) -> tuple[float,
 
 
 @house_style()
-def draw_drop(found: dict[str, Reproduction]) -> Figure:
+def draw_drop(by_set: dict[str, Reproduction]) -> Figure:
     """Draw figures 10 and 11: trajectory, y(t), SOUTH reaction, inner housing."""
     figure, columns = _columns(
-        found, "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", 11.4, heights=(1.25, 1, 1, 1)
+        by_set, "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", 11.4, heights=(1.25, 1, 1, 1)
     )
     for one, (path, height, force, house) in columns:
         run, t = one.drop, one.drop.times_s * 1e3
@@ -150,10 +150,10 @@ def _phases(one: Reproduction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @house_style()
-def draw_hammer(found: dict[str, Reproduction]) -> Figure:
+def draw_hammer(by_set: dict[str, Reproduction]) -> Figure:
     """Draw figures 12 and 13: orbit, spin, x(t), y(t)."""
     figure, columns = _columns(
-        found, "Figs. 12, 13: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", 11.4, heights=(1.5, 0.9, 1, 1)
+        by_set, "Figs. 12, 13: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", 11.4, heights=(1.5, 0.9, 1, 1)
     )
     for one, (orbit, spin, across, up) in columns:
         run, t = one.whirl, one.whirl.times_s
@@ -177,9 +177,9 @@ def draw_hammer(found: dict[str, Reproduction]) -> Figure:
 
 
 @house_style()
-def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
+def draw_waterfall(by_set: dict[str, Reproduction]) -> Figure:
     """Draw figure 14: full spectrum over time, and that of the settled whirl, which separates 81.7 from 83.7 Hz."""
-    figure, columns = _columns(found, "Fig. 14: full spectrum at the disk", 7.4, heights=(1.2, 1.0))
+    figure, columns = _columns(by_set, "Fig. 14: full spectrum at the disk", 7.4, heights=(1.2, 1.0))
     mesh: Any = None
     for one, (axes, lines) in columns:
         times, frequencies, amplitude = spectra(one.whirl)
@@ -201,10 +201,10 @@ def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
 
 
 @house_style()
-def draw_reactions(found: dict[str, Reproduction]) -> Figure:
+def draw_reactions(by_set: dict[str, Reproduction]) -> Figure:
     """Draw figure 15: horizontal and vertical reactions, with separate scales for impacts and whirl."""
     figure, columns = _columns(
-        found, "Fig. 15: reactions, the difference of opposed transducers", 11.0, heights=(1, 1, 1, 1)
+        by_set, "Fig. 15: reactions, the difference of opposed transducers", 11.0, heights=(1, 1, 1, 1)
     )
     for one, panels in columns:
         run, t = one.whirl, one.whirl.times_s
@@ -225,9 +225,9 @@ def draw_reactions(found: dict[str, Reproduction]) -> Figure:
 
 
 @house_style()
-def draw_east(found: dict[str, Reproduction]) -> Figure:
+def draw_east(by_set: dict[str, Reproduction]) -> Figure:
     """Draw figure 16: EAST in full annular whirl, over a turn and a half."""
-    figure, columns = _columns(found, "Fig. 16: EAST in full annular whirl", 4.9)
+    figure, columns = _columns(by_set, "Fig. 16: EAST in full annular whirl", 4.9)
     for one, (axes,) in columns:
         run = one.whirl
         last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.030)
@@ -247,9 +247,9 @@ def draw_east(found: dict[str, Reproduction]) -> Figure:
 
 
 @house_style()
-def draw_speeds(found: dict[str, Reproduction]) -> Figure:
+def draw_speeds(by_set: dict[str, Reproduction]) -> Figure:
     """Draw figure 17: EAST at four speeds."""
-    figure, columns = _columns(found, "Fig. 17: EAST (E − W) in full annular whirl at four speeds", 4.6)
+    figure, columns = _columns(by_set, "Fig. 17: EAST (E − W) in full annular whirl at four speeds", 4.6)
     for one, (axes,) in columns:
         for speed, colour in zip(SPEEDS_HZ, (SKY, GREEN, ORANGE, PINK), strict=True):
             run = one.speeds[speed]

@@ -70,9 +70,9 @@ def _derived_numbers(findings: Findings) -> Content:
         ("the same with M_ih + M_oh of eqs. 24, 25 [N s/m]", None, damping(0.054, support, printed_outer + inner)),
         ("the same with the corrected M_oh alone [N s/m]", None, damping(0.054, support, outer)),
     ]  # fmt: skip
-    given = 0.90
-    eq_44 = impact(mass=1.0, speed=0.1, stiffness=1e10, exponent=1.5, factor=0.75 * (1.0 - given**2), speed_floor=1e-3)
-    derived.append(("e that eq. 44 returns for a specified 0.90 [1]", given, eq_44.restitution))
+    e = 0.90
+    eq_44 = impact(mass=1.0, speed=0.1, stiffness=1e10, exponent=1.5, factor=0.75 * (1.0 - e**2), speed_floor=1e-3)
+    derived.append(("e that eq. 44 returns for a specified 0.90 [1]", e, eq_44.restitution))
     for axis, zeta in zetas.items():
         of_mass = damping(zeta, "magnet.stiffness", p["shaft.mass"])
         decays = of_mass / damping(1.0, "magnet.stiffness", modal)
@@ -91,14 +91,14 @@ def _derived_numbers(findings: Findings) -> Content:
 def idle_changes(findings: Findings) -> list[str]:
     """Return the changes that move neither the force in whirl nor the highest one by `IDLE_N`."""
     peaks = {bar.name: bar for bar in bars(findings.results, "peak_x_n")}
-    found = bars(findings.results, "reaction_x_n")
-    return [bar.name for bar in found if max(bar.width, peaks[bar.name].width) < IDLE_N]
+    chart = bars(findings.results, "reaction_x_n")
+    return [bar.name for bar in chart if max(bar.width, peaks[bar.name].width) < IDLE_N]
 
 
 def _tornado(findings: Findings) -> Content:
-    found = bars(findings.results, "reaction_x_n")
+    chart = bars(findings.results, "reaction_x_n")
     peaks = {bar.name: bar for bar in bars(findings.results, "peak_x_n")}
-    reached = {bar.name for bar in select_lower_ends(found)}
+    reached = {bar.name for bar in select_lower_ends(chart)}
     idle = set(idle_changes(findings))
 
     def row(bar: Bar) -> Row:
@@ -108,7 +108,7 @@ def _tornado(findings: Findings) -> Content:
         return Row(cells, "good" if there else "plain")
 
     headings = ("change", "kind", "E − W in whirl [N]", "change [N]", "highest E − W [N]")
-    return Content((*headings, f"reaches {MEASURED_N:g} N"), [row(bar) for bar in found if bar.name not in idle])
+    return Content((*headings, f"reaches {MEASURED_N:g} N"), [row(bar) for bar in chart if bar.name not in idle])
 
 
 def _range(values: tuple[float, ...]) -> str:

@@ -94,7 +94,7 @@ def _ring_motion(constants: Constants, whirl: float, force: float) -> tuple[comp
         (house.inner_beam_stiffness + 1j * whirl * house.inner_beam_damping, complex(house.pair_stiffness_horizontal)),
         (complex(house.pair_stiffness_vertical), house.outer_beam_stiffness + 1j * whirl * house.outer_beam_damping),
     )
-    found = []
+    amplitudes = []
     for link, support in lines:
         matrix = np.array(
             [
@@ -102,8 +102,8 @@ def _ring_motion(constants: Constants, whirl: float, force: float) -> tuple[comp
                 [-link, link + support - house.outer_mass * whirl**2],
             ]
         )
-        found.append(complex(np.linalg.solve(matrix, np.array([force, 0.0]))[0]))
-    return found[0], found[1]
+        amplitudes.append(complex(np.linalg.solve(matrix, np.array([force, 0.0]))[0]))
+    return amplitudes[0], amplitudes[1]
 
 
 def friction_swing(constants: Constants, spin: float) -> float:
@@ -237,18 +237,18 @@ class Threshold(NamedTuple):
 
 def start_thresholds(frictions: tuple[float, ...] = FRICTIONS) -> list[Threshold]:
     """Return the slowest accelerating sliding whirl [Hz], by friction; `full` is NaN, as its magnets are not linear."""
-    found = []
+    rows = []
     for mu in frictions:
         constants = bare_rig(mu)
         closed = critical_whirl(oscillator(constants), mu)
         bare = bisect(partial(gains_speed, constants), 0.6 * closed, 2.0 * closed)
-        found.append(Threshold(mu, math.nan, closed / (2 * math.pi), bare / (2 * math.pi), math.nan, math.nan, _NAN))
-    return found
+        rows.append(Threshold(mu, math.nan, closed / (2 * math.pi), bare / (2 * math.pi), math.nan, math.nan, _NAN))
+    return rows
 
 
 def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ) -> list[Threshold]:
     """Return the least friction that sustains a rolling whirl, by spin."""
-    found = []
+    thresholds = []
     for spin_hz in spins_hz:
         spin = 2.0 * math.pi * spin_hz
         bare = bare_rig(0.25)
@@ -257,8 +257,8 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ) -> list[Threshold
         full = base_model(ModelLevels()).constants
         bare_mu, full_mu = (bisect(_make_test(each, spin), 0.3 * closed, 6.0 * closed) for each in (bare, full))
         with_houses, used = friction_with_houses(full, spin), friction_demand(full, spin)
-        found.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
-    return found
+        thresholds.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
+    return thresholds
 
 
 class Slip(NamedTuple):
@@ -293,7 +293,7 @@ def find_slips() -> list[Slip]:
     constants = constants._replace(magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0), torque_gain=0.0)
     own, r0, radius = oscillator(constants), constants.contact.clearance, constants.shaft.radius
     spin, kept, mu = 2.0 * math.pi * 6.2, remaining_spin(constants), constants.contact.friction
-    found = []
+    slips = []
     for whirl_hz in (12.0, 20.0, 40.0):
         begin = 2.0 * math.pi * whirl_hz
         # The initial whirl adds to the momentum from friction: I_zz spin + m R_S v is conserved.
@@ -305,8 +305,8 @@ def find_slips() -> list[Slip]:
         )
         rolls_s = find_rolling_start(motion.times, motion.rows, radius)
         spin_end = float(motion.column("theta_rate")[motion.times >= rolls_s].mean())
-        found.append(Slip(whirl_hz, spin_end / spin, after, rolls_s, (high - low) / (2.0 * mu * own.natural)))
-    return found
+        slips.append(Slip(whirl_hz, spin_end / spin, after, rolls_s, (high - low) / (2.0 * mu * own.natural)))
+    return slips
 
 
 def friction_demand(constants: Constants, spin: float) -> tuple[float, float]:

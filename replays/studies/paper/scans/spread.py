@@ -67,21 +67,21 @@ def free_values() -> tuple[Assumed, ...]:
 
 def format_value(entry: Assumed) -> str:
     """Return the value of the default set, or of this report, with its unit."""
-    known = load_parameters(DEFAULT_SET).entries.get(entry.key)
-    value = known.value if known else entry.value
-    unit = known.unit if known and not entry.unit else entry.unit
+    default = load_parameters(DEFAULT_SET).entries.get(entry.key)
+    value = default.value if default else entry.value
+    unit = default.unit if default and not entry.unit else entry.unit
     return f"{value:g} {unit}".strip() if isinstance(value, float | int) else str(value)
 
 
 def changes(values: dict[str, float]) -> dict[str, Any]:
     """Return the changes of a pulse from free values by key, including tied values."""
-    found: dict[str, Any] = {}
+    changed: dict[str, Any] = {}
     for entry in assumed_values():
         if entry.tied and entry.tied in values:
-            found[entry.change_key] = values[entry.tied] / entry.ratio
+            changed[entry.change_key] = values[entry.tied] / entry.ratio
         elif entry.key in values:
-            found[entry.change_key] = values[entry.key]
-    return found
+            changed[entry.change_key] = values[entry.key]
+    return changed
 
 
 def one_at_a_time() -> list[tuple[Assumed, Pulse, Pulse]]:
@@ -131,8 +131,8 @@ def rank_correlation(parts: np.ndarray, values: np.ndarray) -> np.ndarray:
     there = np.isfinite(values)
     if there.sum() < 4 or np.ptp(values[there]) == 0.0:
         return np.full(parts.shape[1], math.nan)
-    found: list[Any] = [spearmanr(parts[there, k], values[there]) for k in range(parts.shape[1])]
-    return np.array([float(each.statistic) for each in found])
+    tests: list[Any] = [spearmanr(parts[there, k], values[there]) for k in range(parts.shape[1])]
+    return np.array([float(each.statistic) for each in tests])
 
 
 def percentiles(values: np.ndarray) -> tuple[float, float, float]:

@@ -58,11 +58,11 @@ def draw_map(engines: list[str], *, quick: bool) -> Any:
     return figure
 
 
-def _draw_oscillator(ax: Any, found: atlas.Map) -> None:
+def _draw_oscillator(ax: Any, chart: atlas.Map) -> None:
     """Draw one engine on one oscillator: median over all stiffnesses and spread; growth is drawn at the top."""
-    run = np.isfinite(found.ratio) | (found.ratio == np.inf)
-    product = (found.steps_us * 1e-6 * np.sqrt(found.stiffness / found.mass)[:, None])[run]
-    change = np.where(found.ratio <= atlas.GROWN, np.maximum(np.abs(found.ratio - 1.0), _LEAST), np.inf)[run]
+    run = np.isfinite(chart.ratio) | (chart.ratio == np.inf)
+    product = (chart.steps_us * 1e-6 * np.sqrt(chart.stiffness / chart.mass)[:, None])[run]
+    change = np.where(chart.ratio <= atlas.GROWN, np.maximum(np.abs(chart.ratio - 1.0), _LEAST), np.inf)[run]
     edges = np.geomspace(product.min(), 1.001 * product.max(), 25)
     place = np.digitize(product, edges)
     kept = [n for n in range(1, len(edges)) if np.any(place == n)]
@@ -70,15 +70,15 @@ def _draw_oscillator(ax: Any, found: atlas.Map) -> None:
     low, middle, high = np.transpose(
         [np.quantile(change[place == n], (0.05, 0.5, 0.95), method="nearest") for n in kept]
     )
-    own = traits(found.engine)
+    own = traits(chart.engine)
     lasts = np.isfinite(middle)
     ax.fill_between(x[lasts], low[lasts], np.minimum(high[lasts], _GROWS), color=own.colour, alpha=0.15, lw=0)
     drawn = np.where(lasts, middle, _GROWS)
     # Points beyond the first growing one add no information.
     drawn = drawn[: int(np.argmin(lasts)) + 1] if not lasts.all() else drawn
-    ax.plot(x[: len(drawn)], drawn, color=own.colour, marker=own.marker, ms=5, lw=1.6, label=found.engine)
-    if np.isfinite(found.limit):
-        ax.axvline(found.limit, color=own.colour, ls=":", lw=1.5, zorder=1)
+    ax.plot(x[: len(drawn)], drawn, color=own.colour, marker=own.marker, ms=5, lw=1.6, label=chart.engine)
+    if np.isfinite(chart.limit):
+        ax.axvline(chart.limit, color=own.colour, ls=":", lw=1.5, zorder=1)
 
 
 @house_style()
@@ -151,11 +151,11 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
         if len(rows):
             plane.plot(right.frictions[columns], impulses[rows], own.marker, color=own.colour, mec=BLACK, ms=9,
                        label=f"{engine} tells another")  # fmt: skip
-        found = int(wrong.sum()), int(np.sum(wrong & clear))
-        for offset, number, fill in ((-width / 2, found[0], own.colour), (width / 2, found[1], "white")):
+        wrong_counts = int(wrong.sum()), int(np.sum(wrong & clear))
+        for offset, number, fill in ((-width / 2, wrong_counts[0], own.colour), (width / 2, wrong_counts[1], "white")):
             counts.barh(row + offset, number, height=width, color=fill, ec=own.colour, lw=1.2)
             counts.text(number, row + offset, f" {number}", va="center", fontsize=9.5)
-        bars.append(found[0])
+        bars.append(wrong_counts[0])
     plane.set(title=f"By taylor at a tolerance of 1e-12, {points} x {points} runs", xlabel="friction coefficient µ [1]",
               ylabel="impulse of the pulse [N s]")  # fmt: skip
     counts.set(title="Runs that end in another class", xlabel=f"runs of {right.classes.size} [1]",

@@ -81,7 +81,7 @@ def exact_states(scene: Scene) -> np.ndarray:
     Raises:
         SimulationError: If `taylor` and `rk8` do not agree.
     """
-    first, second = (run_task(Task(scene, name, asked)) for name, asked in (("taylor", 1e-11), ("rk8", 1e-11)))
+    first, second = (run_task(Task(scene, name, tolerance)) for name, tolerance in (("taylor", 1e-11), ("rk8", 1e-11)))
     failed = first.failure or second.failure
     if failed or scaled_error(first.states, second.states) > AGREE_ERROR:
         raise SimulationError(f"no two accurate engines agree on scene {scene.name}")
@@ -141,18 +141,18 @@ def _kind(error: float, *, warns: bool, gained: float) -> str:
 
 
 @house_style()
-def draw_scene_atlas(folder: Path, found: list[SceneOutcome]) -> list[Path]:
+def draw_scene_atlas(folder: Path, results: list[SceneOutcome]) -> list[Path]:
     """Draw a row per method and a column per scene: outcomes of its settings, coarsest first.
 
     Returns:
         The files: PNG and SVG.
     """
-    scenes, methods = (list(dict.fromkeys(getattr(one, key) for one in found)) for key in ("scene", "method"))
+    scenes, methods = (list(dict.fromkeys(getattr(one, key) for one in results)) for key in ("scene", "method"))
     figure = new_figure(1.6 + 0.42 * len(methods), "Twelve scenes: what becomes of each, the coarsest setting first")
     axes = figure.subplots()
     for y, method in enumerate(methods):
         for x, scene in enumerate(scenes):
-            cell = [one for one in found if (one.scene, one.method) == (scene, method)]
+            cell = [one for one in results if (one.scene, one.method) == (scene, method)]
             for place, one in enumerate(cell):
                 width, colour = 0.86 / len(cell), OUTCOMES[one.kind][0]
                 left, hatch = x - 0.43 + place * width, HATCHES.get(one.kind, "")

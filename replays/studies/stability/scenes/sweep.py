@@ -72,8 +72,8 @@ def sweep(
     stamp = {"code": code, "commit": commit(), "machine": machine()}
     with Worker() as worker:
         for number in missing:
-            found = measure(draw_scene(seed, number), engines, run or worker.run, limit_s=_LIMIT_S)
-            row = {"seed": seed, "number": number, **found, **stamp}
+            measured = measure(draw_scene(seed, number), engines, run or worker.run, limit_s=_LIMIT_S)
+            row = {"seed": seed, "number": number, **measured, **stamp}
             if journal is not None:
                 journal.add(row)
             yield row

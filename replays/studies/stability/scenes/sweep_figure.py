@@ -31,8 +31,8 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
     Returns:
         The files.
     """
-    found = summary(rows, engines)
-    scenes, main = found["scenes"], next(iter(ENGINES))
+    result = summary(rows, engines)
+    scenes, main = result["scenes"], next(iter(ENGINES))
     figure = new_figure(
         5.4,
         f"{len(rows)} random scenes: {scenes['decided']} where two accurate engines agree, {scenes['chaotic']} chaotic",
@@ -47,7 +47,7 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
         wrong = [
             one["error"] or (np.inf if one["failure"] else _FLOOR) for row, one in ran if row["status"] == "decided"
         ]
-        silent = len(found["engines"][engine]["silent"])
+        silent = len(result["engines"][engine]["silent"])
         main_one = engine == main
         style = {"color": traits(engine).colour, "lw": 3.0 if main_one else 1.6, "zorder": 8 if main_one else 5}
         _shares(errors, wrong, label=f"{engine}: {silent} of {len(wrong)}", **style)

@@ -146,6 +146,6 @@ def _find_deviating_engine(runs: list[tuple[Task, SceneRun]]) -> str | None:
 
 def _scene_changes(scene: Scene) -> Row:
     """Return the settings in which a scene differs from the defaults, sufficient to run it again."""
-    given = scene_document(scene)
+    document = scene_document(scene)
     defaults = scene_document(Scene())
-    return {key: value for key, value in given.items() if value != defaults[key] and key != "engine"}
+    return {key: value for key, value in document.items() if value != defaults[key] and key != "engine"}
