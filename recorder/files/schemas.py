@@ -183,7 +183,15 @@ def event_text(event: dict[str, Any]) -> tuple[int, str]:
     if kind == "note":
         tags = event.get("tags")
         tags = "".join(f" #{tag}" for tag in tags) if isinstance(tags, list) else ""
-        return LOG_INFO, f"note: {event.get('text', '')}{tags}"
+        return LOG_INFO, f"note: {event.get('text', '')}{tags}{_origin(event)}"
+    if kind == "fault" and isinstance(what := event.get("what"), dict):
+        given = {name: value for name, value in what.items() if name != "kind" and value is not None}
+        numbers = "".join(f", {name} {_brief(value)}" for name, value in given.items())
+        lasts = "" if event.get("for_s") is None else f", for {_brief(event['for_s'])} s"
+        text = f"{event.get('channel')} {what.get('kind')}{numbers}{lasts}"
+        return LOG_INFO, f"fault {event.get('fault')}: {text}{_origin(event)}"
+    if kind == "clear" and event.get("channels"):
+        return LOG_INFO, f"clear: fault {_join(event.get('fault'))} of {_join(event['channels'])}{_origin(event)}"
     if kind == "warning":
         return LOG_WARN, str(event.get("text", "warning"))
     level = LOG_ERROR if kind == "end" and reason.startswith("failed") else LOG_INFO
@@ -193,6 +201,15 @@ def event_text(event: dict[str, Any]) -> tuple[int, str]:
     shown |= request if isinstance(request, dict) else {}
     details = ", ".join(f"{name} {_brief(value)}" for name, value in shown.items())
     return level, f"{kind}: {details}" if details else kind
+
+
+def _join(values: Any) -> str:
+    return ", ".join(map(str, values)) if isinstance(values, list) else str(values)
+
+
+def _origin(event: dict[str, Any]) -> str:
+    """Return the sender of an event in brackets, or an empty text."""
+    return f" (from {event['from']})" if event.get("from") else ""
 
 
 def _brief(value: Any) -> str:

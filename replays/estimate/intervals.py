@@ -202,3 +202,11 @@ def pool_estimates(values: np.ndarray, weights: np.ndarray, *, equal_errors: boo
     whole = weights.sum()
     half = np.sqrt(weights).sum() / whole if equal_errors else whole**-0.5
     return float(weights @ values / whole), float(half)
+
+
+def format_with_half_width(value: float, half: float) -> str:
+    """Return a value and half of its interval as text, with two significant digits of the latter in both."""
+    if not 1e-9 < half < 100.0:
+        return f"{value:.6g} ±{half:.2g}"
+    digits = 1 - math.floor(math.log10(half))
+    return f"{value:.{digits}f} ±{half:.{digits}f}"

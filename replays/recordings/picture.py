@@ -33,7 +33,7 @@ def draw(recording: Recording, path: Path) -> None:
     scene, parameters = recording.scene["name"], recording.parameters["set"]
     figure = new_figure(
         9.6,
-        f"Scene {scene}, parameters {parameters}, hammer at {hammer_s:.2f} s:\nwhirl "
+        f"Scene {scene}, parameter set {parameters}, hammer at {hammer_s:.2f} s:\nwhirl "
         f"at {figures.frequency_hz:.2f} Hz, spin at {figures.spin_hz:.3f} Hz, read off the recording",
     )
     axes = figure.subplots(3, 3)
@@ -49,7 +49,7 @@ def draw(recording: Recording, path: Path) -> None:
 
     ax = axes[1, 0]
     kept = (drive.times_s >= hammer_s - 0.5) & (drive.times_s < hammer_s + 2.5)
-    draw_signals(ax, drive.times_s[kept], (drive["speed"][kept], BLACK, ""))
+    draw_signals(ax, drive.times_s[kept], (drive["speed"][kept], BLACK, "speed"))
     ax.axvline(hammer_s, color="0.5", lw=0.9, ls=":", label="hammer")
     ax.set(title="Spin, around the hammer", xlabel="time [s]", ylabel="spin speed [Hz]")
     ax.legend(loc="lower right")
@@ -122,5 +122,6 @@ def _draw_pair(
     draw_signals(ax, times_s[kept], (pair[0][kept], _X, names[0]), (pair[1][kept], _Y, names[1]))
     ax.set(xlabel="time [s]", xlim=window)
     low, high = ax.get_ylim()
-    ax.set_ylim(low, high + 0.2 * (high - low))
-    ax.legend(loc="upper center", ncols=2)
+    ax.set_ylim(low, high + 0.35 * (high - low))
+    found = {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    ax.legend(found.values(), found.keys(), loc="upper center", ncols=2, handlelength=1.2, columnspacing=1.0)

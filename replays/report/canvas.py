@@ -106,7 +106,7 @@ def draw_signals(axes: Any, times: np.ndarray, *signals: tuple[np.ndarray, str, 
     Args:
         axes: Axes to draw on.
         times: Times, shape (n,).
-        signals: Values, shape (n,), colour and name of each signal.
+        signals: Values, shape (n,), colour and name of each signal; with a name, the legend explains a band.
     """
     periods = max(np.count_nonzero(np.diff(values > values.mean())) // 2 for values, _, _ in signals)
     # Each slice holds two periods; otherwise the band would depend on the position of its limits.
@@ -118,10 +118,11 @@ def draw_signals(axes: Any, times: np.ndarray, *signals: tuple[np.ndarray, str, 
             continue
         folded, middle = values[:whole].reshape(slices, -1), times[:whole].reshape(slices, -1).mean(axis=1)
         low, high = folded.min(axis=1), folded.max(axis=1)
-        axes.fill_between(middle, low, high, color=colour, alpha=0.13, lw=0)
+        band = "envelope" if label else ""
+        axes.fill_between(middle, low, high, color=colour, alpha=0.13, lw=0, label=band)
         for edge in (low, high):
             axes.plot(middle, edge, color=colour, lw=0.7, alpha=0.8)
-        axes.plot(middle, folded.mean(axis=1), color=colour, lw=1.4, label=label)
+        axes.plot(middle, folded.mean(axis=1), color=colour, lw=1.4, label=label and f"{label}, mean")
 
 
 def axis_label(name: str, unit: str) -> str:

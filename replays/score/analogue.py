@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,12 +107,13 @@ class Fitted:
 
 def fit_channels(
     recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session, formulas: Mapping[str, Formula],
-    remarks: list[str],
+    remarks: list[str], step: Callable[[str], None] = lambda _text: None,
 ) -> tuple[list[Fitted], list[Alignment]]:  # fmt: skip
     """Fit all connected signals, and align their tables with the session.
 
     A signal with several possible channels is fitted only if its channel explains it.
     """
+    step("aligning the rows with the session")
     zero_s = min((signal.first_s for signal in recorded.values() if signal.first_s is not None), default=0.0)
     tables: dict[int, list[RowSource]] = {}
     parts_of: dict[str, tuple[Sampled, Sampled, Sampled] | None] = {}
@@ -144,11 +145,14 @@ def fit_channels(
         )
         tables.setdefault(id(signal.table), []).append(source)
     fits, alignments = [], []
+    number, total = 0, sum(map(len, tables.values()))
     for sources in tables.values():
         if (alignment := align(sources)) is None:
             continue
         alignments.append(alignment)
         for source in sources:
+            number += 1
+            step(f"fitting {source.name}, {number} of {total}")
             converter = None if source.wire.channel in formulas else _converter(session, source.channel)
             one = _fit(source, alignment, parts_of[source.name], converter)
             if one is not None and (one.good or source.name == source.wire.channel or not source.wire.rivals):
@@ -233,10 +237,20 @@ def _fit_alias(fit: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, 
 
 def score_analogue(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session,
-    formulas: Mapping[str, Formula],
+    formulas: Mapping[str, Formula], as_mapped: Collection[str] = (), step: Callable[[str], None] = lambda _text: None,
 ) -> list[Fitted]:  # fmt: skip
-    """Add the rows of the analogue path to a scorecard, and return the fits of its channels."""
-    fits, alignments = fit_channels(recorded, wires, session, formulas, card.remarks)
+    """Add the rows of the analogue path to a scorecard, and return the fits of its channels.
+
+    Args:
+        card: The scorecard.
+        recorded: Signals of the file.
+        wires: Their channels.
+        session: The session.
+        formulas: Exact signals by channel.
+        as_mapped: Signals whose channel the user's mapping gives.
+        step: Function that is called with the current step.
+    """
+    fits, alignments = fit_channels(recorded, wires, session, formulas, card.remarks, step)
     fitted = {one.name for one in fits}
     _score_rows(card, alignments, recorded)
     for name, wire in wires.items():
@@ -245,7 +259,7 @@ def score_analogue(
             card.add("gain", name, None, note=note)
     ambiguous = {name for each in alignments if each.ambiguous for name in each.names}
     _score_time(card, [one for one in fits if one.good], ambiguous)
-    _score_wires(card, recorded, wires, fits, ambiguous, session, alignments)
+    _score_wires(card, recorded, wires, fits, ambiguous, session, alignments, as_mapped)
     sines = []
     for one in fits:
         _score_fit(card, one)
@@ -387,7 +401,7 @@ def _is_biased(signal: Recorded, channel: Channel) -> bool:
 
 def _score_wires(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], fitted: list[Fitted],
-    ambiguous: set[str], session: Session, alignments: Sequence[Alignment],
+    ambiguous: set[str], session: Session, alignments: Sequence[Alignment], as_mapped: Collection[str],
 ) -> None:  # fmt: skip
     """Add mapping and polarity of the signals with a gain; a signal with a channel's name must be that channel."""
     fits = {one.name: one for one in fitted if one.good}
@@ -413,6 +427,8 @@ def _score_wires(
         elif not wire.channel or wire.rivals or name not in fits:
             verdict = INCONCLUSIVE
             note += f"; equally similar to {', '.join(wire.rivals)}" if wire.rivals else ""
+            if name in fits and name == wire.channel and name in as_mapped:
+                verdict, note = NO_LIMIT, f"as mapped; {note}"
         elif name in session.channels:
             verdict = PASS
         rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
@@ -424,6 +440,8 @@ def _score_wires(
             verdict = INCONCLUSIVE
         elif name in open_ and not (mixed and not upright):
             verdict, note = INCONCLUSIVE, "inverted half a period later"
+            if name in as_mapped and upright:
+                verdict, note = NO_LIMIT, f"as mapped; {note}"
         elif name in open_:
             note = "inverted relative to the others, from any begin"
         rows.append(text_row(card.path, "polarity", name, "as sent" if upright else "turned", verdict, note))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -49,6 +49,7 @@ def judge(
     path: Literal["digital", "analogue"] | None = None, formulas: Mapping[str, Formula] | None = None,
     options: formats.FileOptions | None = None, arrivals: Arrivals | None = None,
     channels: Sequence[str] | None = None, mapping: formats.Mapping | None = None,
+    step: Callable[[str], None] = lambda _text: None, report: Callable[[str], None] = lambda _text: None,
 ) -> Scorecard:  # fmt: skip
     """Return the scorecard for a DAQ's file.
 
@@ -64,11 +65,14 @@ def judge(
         channels: Channels or groups of the session that were to be recorded; all by default.
         mapping: Format of the file, and source and unit of each channel; only its tables [file] and [channels] are
             used.
+        step: Function that is called with the current step.
+        report: Function that is called with the channel of each signal, before the long work.
 
     Raises:
         InputError: A file cannot be read, or none of its signals was sent.
     """
     limits = load_limits() if limits is None else limits
+    step("reading rows")
     session = Session(against)
     due = _select_channels(session, channels)
     remarks: list[str] = []
@@ -81,6 +85,7 @@ def judge(
         sent |= {name: (early[:, n], session.rate_hz(group)) for n, name in enumerate(names)}
     rate = max(each for _, each in sent.values())
     recorded = _name_signals(separate_rates(opened, rate))
+    step("assigning signals to channels")
     wires: dict[str, Wire] = {}
     rows: dict[str, SignalRows] = {}
     if path != "analogue":
@@ -106,16 +111,21 @@ def judge(
             units.parse(unit, field=f"unit of {name}, or that of -m MAPPING,", also=COUNTS)
     if path == "digital" and not rows:
         raise InputError("--path", "analogue, as the values are not counts", path)
+    report(_describe_wires(wires))
+    as_mapped = () if mapping is None else mapping.channels.keys()
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds, remarks=remarks)
-    _score_wires(card, wires, session, rows if path == "digital" else {})
+    _score_wires(card, wires, session, rows if path == "digital" else {}, as_mapped)
     _score_recorded(card, recorded, wires, due)
     if path == "digital":
         if arrivals is not None:
             headings = int(arrivals.rows[-1]) - max(each.rows for each in recorded.values())
             arrivals = replace(arrivals, rows=arrivals.rows - headings)
+        step("comparing rows")
         score_digital(card, recorded, wires, rows, session, arrivals)
     else:
-        fitted = score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
+        known = {**session.formulas(), **(formulas or {})}
+        fitted = score_analogue(card, recorded, wires, session, known, as_mapped, step)
+        step("quantities of the converter")
         score_converter(card, fitted)
     card.evidence_gaps += _missing_evidence(card, due)
     return card
@@ -137,6 +147,13 @@ def _missing_evidence(card: Scorecard, due: Sequence[str]) -> list[str]:
             note = next(filter(None, notes), "")
             reasons.append(f"{channel}: {core} is inconclusive{': ' if note else ''}{note}")
     return reasons
+
+
+def _describe_wires(wires: Mapping[str, Wire]) -> str:
+    """Return the channel that each signal is most similar to, with the correlation, in one line."""
+    return "signals assigned: " + ", ".join(
+        f"{name} is {each.channel or 'no channel'} ({each.likeness:.3f})" for name, each in wires.items()
+    )
 
 
 def _snap(rate_hz: float, sent_hz: float) -> float:
@@ -179,7 +196,10 @@ def _name_signals(signals: Sequence[Recorded]) -> dict[str, Recorded]:
     return by_name
 
 
-def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, rows: Mapping[str, SignalRows]) -> None:
+def _score_wires(
+    card: Scorecard, wires: Mapping[str, Wire], session: Session, rows: Mapping[str, SignalRows],
+    as_mapped: Collection[str],
+) -> None:  # fmt: skip
     """Add mapping and polarity on the digital path: a signal with a channel's name must be that channel."""
     for name, wire in (wires if card.path == "digital" else {}).items():
         channels = session.channels.keys()
@@ -190,6 +210,8 @@ def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, r
         if not wire.channel or not certain:
             verdict = INCONCLUSIVE
             note += f"; equally similar to {', '.join(wire.rivals)}" if wire.rivals else ""
+            if name == wire.channel and name in as_mapped:
+                verdict, note = NO_LIMIT, f"as mapped; {note}"
         elif name in channels:
             verdict = PASS if wire.channel == name else FAIL
         card.rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
@@ -198,6 +220,8 @@ def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, r
             open_ = wire.ambiguous if scale is None else not scale.known
             verdict = INCONCLUSIVE if open_ else FAIL if inverted else PASS
             note = "inverted half a period later" if wire.ambiguous and open_ else ""
+            if open_ and name in as_mapped and not inverted:
+                verdict, note = NO_LIMIT, f"as mapped; {note}".removesuffix("; ")
             card.rows.append(text_row(card.path, "polarity", name, "turned" if inverted else "as sent", verdict, note))
     wired = [wire.channel for wire in wires.values() if wire.channel]
     for channel in dict.fromkeys(each for each in wired if wired.count(each) > 1):

@@ -10,7 +10,17 @@ import numpy as np
 from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, axis_label, draw_signals, house_style, new_figure
 from replays.score.analogue import Fitted
-from replays.score.card.scorecard import FAIL, INCONCLUSIVE, MARKS, NO_LIMIT, PASS, Scorecard, Verdict, make_matrix
+from replays.score.card.scorecard import (
+    FAIL,
+    INCONCLUSIVE,
+    LEGEND,
+    MARKS,
+    NO_LIMIT,
+    PASS,
+    Scorecard,
+    Verdict,
+    make_matrix,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,7 +52,7 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
         report.table(
             ("quantity", *names[first : first + _MATRIX_COLUMNS], "worst"),
             [_matrix_row(line[0], line[part]) for line in lines if any(line[part])],
-            caption="+ pass, X fail, ? inconclusive",
+            caption=LEGEND,
         )
     for line in (*card.evidence_gaps, *card.findings):
         report.text(line)

@@ -412,6 +412,8 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
     fields: Any = Scene
     for part in [*path, last]:
         names = _inner(fields)
+        if part not in names and path[:1] == ["commands"]:
+            raise InputError(key, "a key outside the list `commands`: edit [[commands]] in the scene file", value)
         if part not in names:
             names = [*_scene_keys(), *load_parameters().entries]
             raise InputError(key, such_as("a field of a scene or a parameter", key, names), value)

@@ -30,7 +30,7 @@ BUDGETS = {
     "drivers/sources": 967,
     "recorder": 1339,
     "recorder/contents": 1266,
-    "recorder/files": 783,
+    "recorder/files": 795,
     "recorder/output": 542,
     "recorder/viewer": 1893,
     "replays": 0,

@@ -59,7 +59,7 @@ def test_a_note_is_recorded_with_its_time_and_is_no_command(tmp_path: Path) -> N
     assert accepted.tick == note["tick"] == 300_000
     assert (note["text"], note["tags"], note["from"]) == ("bearing is warm", ["bearing", "look"], "a test")
     assert note["wall_s"] > 1e9
-    assert event_text(note)[1] == "note: bearing is warm #bearing #look"
+    assert event_text(note)[1] == "note: bearing is warm #bearing #look (from a test)"
     # It has no effect on the rig: it is not among the commands that must be repeated.
     scene = wire.decode_document(MemoryClient(server).request(wire.SCENE))
     assert all(entry["command"] != "note" for entry in scene["taken"])

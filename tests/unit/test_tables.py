@@ -150,7 +150,7 @@ def test_any_table_is_legible(width: int) -> None:
     table.add_row("all of them")
     check_legible(table, width=width)
     notes = [line for line in render_lines(table, width=width) if line.startswith("without ")]
-    assert notes == ([] if width == 300 else ["without unit, source: see --wide"])
+    assert notes == ([] if width == 300 else ["columns left out: unit, source (shown with --wide)"])
 
 
 def test_long_text_is_folded_and_not_cut() -> None:

@@ -16,6 +16,8 @@ Standing = Literal["identified", "not seen", "only together", "at its bound", "n
 
 _CHI2_TOLERANCE = 0.03
 """Allowed excess of the sum of squares per degree of freedom over 1, as the noise is not known better."""
+MIN_CHI2 = 0.6
+"""Sum of squares per degree of freedom below which the assumed noise is too large."""
 _CHI2_SIGMAS = 5.0
 """Standard deviations of the sum of squares that are allowed as chance."""
 _ERROR_RATIO = 2.0
@@ -104,6 +106,11 @@ class Judgement:
     @property
     def verdict(self) -> str:
         """The verdict in a sentence."""
+        if self.fits and self.chi2 < MIN_CHI2:
+            part = math.sqrt(self.chi2)
+            return (
+                f"the residuals are {part:.2g} times the assumed noise, which is too large: the intervals are too wide"
+            )
         if self.fits and self.white:
             return "the model explains the recording within its noise"
         if self.fits:

@@ -97,6 +97,10 @@ def identify_log(
         change = solve_normal(square + flat.T @ flat, flat.T @ np.nan_to_num(one - residuals).ravel())
         moved = np.hypot(moved, np.abs(change))
     judgement = judge(window, z, slopes, residuals, valid)
+    nominal = {one.key: one.start for one in tuned.fitted}
+    judgement = replace(judgement, findings=tuple(
+        replace(one, unknown=replace(one.unknown, start=nominal[one.unknown.key])) for one in judgement.findings
+    ))  # fmt: skip
     why = "the model, or the search, does not explain later samples"
     if tuned.end_s < tuned.longest_s and any(one.standing == "not seen" for one in judgement.findings[: len(keys)]):
         why += "; later samples may show the missing values, with another --start or contact law"

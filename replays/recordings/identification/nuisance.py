@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
-from replays.estimate.intervals import draw_normal
+from replays.estimate.intervals import draw_normal, format_with_half_width
 from replays.recordings.identification.agreement import (
     MAX_PRIOR_DEVIATION,
     ChannelState,
@@ -28,7 +28,7 @@ from replays.recordings.identification.agreement import (
     split_channels,
     subtract_mean,
 )
-from replays.recordings.identification.request import first_command_s, observe
+from replays.recordings.identification.request import first_command_s, fit_unit, observe
 from replays.recordings.resimulation.experiment import PICKUP_S, Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.resimulation.sensitivity import ANGLE, STATE, Predictor, get_value, to_model_clock, with_values
@@ -110,8 +110,10 @@ class Fitted:
             return f"time: hammer pulse shifted by {late:+.1f} ±{1e6 * self.half_width:.2g} µs, fitted"
         if self.key == "clock.rate_ppm":
             return f"clock: {self.value:+.1f} ±{self.half_width:.2g} ppm fast, fitted"
+        unit = fit_unit(self.key)
+        text = f"{format_with_half_width(self.value, self.half_width)}{f' {unit}' * (unit not in ('', '1'))}"
         change = self.value - self.start
-        return f"{self.key}: {self.value:.6g} ±{self.half_width:.2g}, fitted ({change:+.2g} from the log)"
+        return f"{self.key}: {text}, fitted (changed by {change:+.3g} from the start value {self.start:.6g})"
 
 
 def _is_beyond(value: float, prior: tuple[float, float] | None) -> bool:
@@ -447,8 +449,8 @@ def _fit_windows(
     values = np.array([get_value(baseline, key) for key in wanted])
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
     jackknife = np.zeros(len(values))
-    for length in _WINDOWS_S:
-        progress(f"{len(wanted)} nuisance parameters: to {first_s + length:.3f} s")
+    for n, length in enumerate(_WINDOWS_S, 1):
+        progress(f"{len(wanted)} values, window {n} of {len(_WINDOWS_S)}, to {first_s + length:.3f} s")
         parts = {name: part.select_until(first_s + length) for name, part in whole.items()}
         predictor = Predictor(baseline, tuple(wanted), parts)
         # Without a prior, a value is held so weakly that only one without any effect keeps its start.

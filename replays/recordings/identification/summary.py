@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from replays.recordings.identification.fit import Identification
-from replays.recordings.identification.judgement import Finding
+from replays.recordings.identification.judgement import MIN_CHI2, Finding
+from replays.recordings.identification.request import first_command_s
 from replays.report import Mark, Report, Row
 from replays.report.canvas import (
     BLACK,
@@ -33,6 +34,8 @@ _MARKS: dict[str, Mark] = {
     "identified": "good", "not seen": "open", "only together": "open", "at its bound": "bad",
     "not explained": "bad",
 }  # fmt: skip
+_MIN_LEAD_S = 0.4
+"""Time before the hammer pulse that shows the noise of a log [s]."""
 _MAX_PANELS = 16
 _MAX_LABELLED = 6
 """Number of values up to which the picture shows each correlation as a number."""
@@ -82,6 +85,9 @@ def fit_line(result: Identification) -> str:
     """Return the goodness of the fit."""
     judgement = result.judgement
     line = f"chi2 {judgement.chi2:.4g} per degree of freedom ({judgement.dof}); {judgement.verdict}"
+    lead_s = first_command_s(found.question.experiment) - found.from_s
+    if judgement.fits and judgement.chi2 < MIN_CHI2 and 0.0 < lead_s < _MIN_LEAD_S:
+        line += f"; only {1e3 * lead_s:.0f} ms before the hammer pulse show the noise: record at least 0.5 s"
     if judgement.fits and judgement.inflation > 1.1:
         line += f"; intervals up to {judgement.inflation:.2g} times as wide as from noise alone"
     if judgement.together > 1.0:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -28,7 +28,7 @@ from replays.recordings.validation.explanations.attribution import (
     explain_log,
 )
 from replays.recordings.validation.explanations.explanation import Explanation
-from replays.recordings.validation.explanations.faults import find_common_delay
+from replays.recordings.validation.explanations.faults import find_common_delay, select_channels
 from replays.recordings.validation.explanations.model_parameters import find_changes
 from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
@@ -150,7 +150,8 @@ def validate(
             text = f"closest is {explained.conclusion}; but {min(off)} of {len(judged)} quantities are still off"
             text += ": another number, or several at once; `rig identify` fits them"
             explained = replace(explained, conclusion=text, best=())
-    return replace(validation, explained=explained)
+    failed = [one.channel for one in trajectory if one.good is False]
+    return replace(validation, explained=explain_assumed(explained, recording, failed))
 
 
 def _unexplained(from_s: float, conclusion: str) -> Explained:
@@ -303,10 +304,41 @@ def _explain_log(again: _Resimulation, *, from_s: float, end_s: float, touching:
     )  # fmt: skip
 
 
+def find_assumed_corners(recording: Recording) -> dict[str, float]:
+    """Return the assumed corner of each channel whose mapping has none [Hz], by name; empty for a rig's recording."""
+    mapped = recording.scene["import"]["mapping"]["channels"] if is_imported(recording) else {}
+    known = recording.table.channels
+    return {name: known[name].bandwidth_hz for name, entry in mapped.items() if "bandwidth_hz" not in entry}
+
+
+def explain_assumed(explained: Explained, recording: Recording, failed: Sequence[str]) -> Explained:
+    """Return an explanation of a log that distinguishes an assumed low-pass from a wrong one, and lists open channels.
+
+    Args:
+        explained: The explanation.
+        recording: The log.
+        failed: Channels that fail.
+    """
+    corners, conclusion, ranked = find_assumed_corners(recording), explained.conclusion, []
+    for one in explained.ranked:
+        name, defect = one.channels_and_defect
+        if defect == "bandwidth" and one.unit == "Hz" and name in corners:
+            change = f"low-pass near {one.value:.3g} Hz; none was given ({corners[name]:g} Hz assumed)"
+            advice = f"{name}: {change}. Add `bandwidth_hz = {one.value:.3g}` to [channels.{name}] and import again"
+            conclusion = conclusion.replace(f"{one.name} {one.change}", advice)
+            one = replace(one, change=change)
+        ranked.append(one)
+    best = [one for one in explained.ranked if one.name in explained.best]
+    if best and all(one.kind == "sensor" for one in best):
+        for name in (name for name in failed if name not in select_channels(best, failed)):
+            assumed = f" (assumed: low-pass of {corners[name]:g} Hz)" if name in corners else ""
+            conclusion += f"; {name} fails without a known cause{assumed}"
+    return replace(explained, conclusion=conclusion, ranked=tuple(ranked))
+
+
 def calibration(recording: Recording, experiment: Experiment) -> list[str]:
     """Return the differences of the recording's channels from the scene's table, by default the rig's own."""
     if is_imported(recording):
-        mapped = recording.scene["import"]["mapping"]["channels"]
-        lacking = [name for name, entry in mapped.items() if "bandwidth_hz" not in entry]
+        lacking = find_assumed_corners(recording)
         return [f"no bandwidth given for {', '.join(lacking)}: half of the rate is assumed"] if lacking else []
     return calibration_off(recording.table, experiment.scene.table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.bits import StreamBits
 from replays.recordings.validation.explanations.attribution import Explained
 from replays.recordings.validation.explanations.signals import SignalFault
-from replays.recordings.validation.phases import Phase
+from replays.recordings.validation.phases import QUANTITIES, Phase
 from replays.recordings.validation.statistics import StatisticResult
 from replays.recordings.validation.trajectory import ChannelResidual
 from replays.recordings.validation.truth import TruthResult
@@ -176,6 +177,11 @@ class Validation:
         names = [line.partition(":")[0] for line in self.calibration]
         shown = ", ".join(names[:3]) + (", ..." if names[3:] else "")
         return f"{len(names)} channels ({shown}) differ from the rig's own table; the report says how"
+
+    def legend(self, shown: Callable[[str, str], bool] = lambda _unit, _name: True) -> str:
+        """Return the meaning of the quantities of phases, for those that `shown` selects by unit and name."""
+        units = {one.quantity: one.unit or "1" for one in self.statistics}
+        return "; ".join(f"{name}: {QUANTITIES[name].title}" for name, unit in units.items() if shown(unit, name))
 
     @property
     def bits_line(self) -> str:

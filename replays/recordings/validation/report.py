@@ -11,6 +11,8 @@ import numpy as np
 from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
+from replays.recordings.validation.statistics import NOT_JUDGED
+from replays.recordings.validation.trajectory import PULSES_ONLY
 from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, add_legend, axis_label, draw_signals, house_style, new_figure
 from rig.channels.orbit import full_spectrum
@@ -80,7 +82,7 @@ def _conclusion(report: Report, validation: Validation) -> None:
     report.table(
         ("kind", "candidate", "change", "explained", "residual", "fitted to [s]", "verdict"),
         [
-            Row((e.kind, e.name, e.change, f"{e.explained:.2%}", f"{e.left:.3g}", f"{e.to_s:.3f}",
+            Row((e.kind, e.name, e.change, e.part, f"{e.left:.3g}", f"{e.to_s:.3f}",
                  "named" if e.name in one.best else ""), "good" if e.name in one.best else "plain")
             for e in one.ranked[:20]
         ],
@@ -116,7 +118,7 @@ def _trajectory(report: Report, validation: Validation) -> None:
         [
             Row((r.channel, f"{r.floor:.3g} {r.unit}".rstrip(), f"{r.rms:.3f}",
                  "" if math.isinf(r.limit) else f"{r.limit:.3f}", f"{r.peak:.2f}", f"{r.drift:.2f}", r.reason,
-                 _WORDS[r.good]), _MARKS[r.good])
+                 _WORDS[r.good] + (PULSES_ONLY if r.pulses else "")), _MARKS[r.good])
             for r in validation.residuals
         ],
         caption="Residual over the noise of the recording's own channel table; drift: largest mean of 128 samples, in "
@@ -134,6 +136,7 @@ def _trajectory(report: Report, validation: Validation) -> None:
     windows = "".join(f" and from {begin:.3f} to {end:.3f} s ({why})" for why, begin, end in zooms)
     for part in validation.parts.values():
         caption = f"{part.group}: recorded and predicted, in whole{windows}, and the residual over its noise."
+        caption += " The amplitude of the keyphasor is not compared." * ("keyphasor" in part.names)
         report.picture(_group(validation, part, zooms), caption)
 
 
@@ -143,11 +146,13 @@ def _phases(report: Report, validation: Validation) -> None:
         ("phase", "quantity", "recorded", "predicted", "spread", "limit", "verdict"),
         [
             Row((s.phase, s.title, f"{s.recorded:.6g}", f"{s.foretold:.6g}", f"{s.spread:.2g}",
-                 "" if s.limit is None else f"± {s.limit:.2g}", _WORDS[s.good]), _MARKS[s.good])
+                 "" if s.limit is None else f"± {s.limit:.2g}", NOT_JUDGED if s.too_wide else _WORDS[s.good]),
+                _MARKS[s.good])
             for s in validation.statistics
         ],
         caption="Predicted is the median, spread the standard deviation over perturbed re-simulations with noise; "
-        f"phases are read off the recording ({', '.join(PHASES)}).",
+        f"phases are read off the recording ({', '.join(PHASES)}). {NOT_JUDGED}: the limit is wider than the value. "
+        f"Quantities: {validation.legend()}.",
     )  # fmt: skip
     names = {name for part in validation.parts.values() for name in part.names}
     pairs = [pair for pair in (("ring_x", "ring_y"), ("disk_x", "disk_y")) if names.issuperset(pair)]

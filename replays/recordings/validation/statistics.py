@@ -31,6 +31,12 @@ _ENERGIES = {"dissipated": DISSIPATED, "drive_work": ("drive_work",)}
 """Columns of the truth that sum up to a quantity."""
 
 
+NOT_JUDGED = "not judged"
+"""Verdict where the limit is wider than the value itself."""
+_SIGNED = ("mean_x", "mean_y", "sense")
+"""Quantities with a sign, for which a limit wider than the value has a meaning."""
+
+
 @dataclass(frozen=True)
 class StatisticResult:
     """Result for a quantity of a phase.
@@ -60,12 +66,19 @@ class StatisticResult:
     @property
     def title(self) -> str:
         """Quantity with its unit."""
-        return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
+        return f"{self.quantity} [{self.unit or '1'}]"
+
+    @property
+    def too_wide(self) -> bool:
+        """True if the criterion is met only because its limit is wider than the value itself."""
+        off, size = abs(self.recorded - self.foretold), max(abs(self.recorded), abs(self.foretold))
+        wide = self.limit is not None and off <= self.limit and self.limit > size > 0.0
+        return wide and self.quantity not in (*SPECTRA, *_SIGNED)
 
     @property
     def good(self) -> bool | None:
-        """True if the criterion is met; None without a criterion."""
-        if self.limit is None:
+        """True if the criterion is met; None without a criterion, or if it does not judge."""
+        if self.limit is None or self.too_wide:
             return None
         off = self.recorded - self.foretold
         # A distance of spectra cannot be too small.

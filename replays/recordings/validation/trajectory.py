@@ -18,6 +18,10 @@ _NOISE_LIMIT = 7.0
 """Residual over its floor that noise never reaches."""
 
 
+PULSES_ONLY = ", pulses only"
+"""Addition to the verdict of a channel whose amplitude is not compared."""
+
+
 @dataclass(frozen=True)
 class ChannelResidual:
     """Residual of a channel within the window.
@@ -53,6 +57,11 @@ class ChannelResidual:
     reason: str
     peak_limit: float = math.inf
     drift_limit: float = math.inf
+
+    @property
+    def pulses(self) -> bool:
+        """True for a channel of pulses, of which the amplitude is not compared."""
+        return self.channel == "keyphasor"
 
     @property
     def broken(self) -> tuple[str, float, float] | None:

@@ -335,8 +335,9 @@ _MARGIN = 1.5
 """Length of a 99.7 % interval over that of a 95 % interval, of a normal estimate."""
 _RMS = ("noise", "jitter", "stamp jitter")
 """Quantities that are roots of variances."""
-MARKS: dict[Verdict, str] = {FAIL: "X", INCONCLUSIVE: "?", PASS: "+", NO_LIMIT: ""}
+MARKS: dict[Verdict, str] = {FAIL: "X", INCONCLUSIVE: "?", PASS: "+", NO_LIMIT: "-"}
 """Marks of a matrix, the worst first."""
+LEGEND = "+ pass, X fail, ? inconclusive: not determined by this run, - no limit, blank: not of this channel"
 
 
 def make_matrix(card: Scorecard) -> tuple[list[str], list[tuple[str, ...]]]:

@@ -61,6 +61,7 @@ class Session:
         self._blocks: dict[str, np.ndarray] = {}
         self._stretches: dict[tuple[str, int, int], np.ndarray] = {}
         self._firsts: dict[str, tuple[int, float]] = {}
+        self._early: dict[str, np.ndarray] = {}
 
     def _first(self, group: str) -> tuple[int, float]:
         """Return the number of a group's first row and its rate [Hz], kept for repeated use."""
@@ -124,7 +125,9 @@ class Session:
 
     def early(self, group: str) -> tuple[int, np.ndarray]:
         """Return the number of the first row of a group, and the counts of its first seconds, shape (n, channels)."""
-        return self._first(group)[0], self.stretch(group, 0, round(_BEGIN_SEARCH_S * self.rate_hz(group)))
+        if group not in self._early:
+            self._early[group] = self.stretch(group, 0, round(_BEGIN_SEARCH_S * self.rate_hz(group)))
+        return self._first(group)[0], self._early[group]
 
     def rows(self, group: str) -> int:
         """Return the number of rows of a group."""

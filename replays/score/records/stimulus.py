@@ -13,6 +13,8 @@ _HALF_TAPS, _KAISER, _CUTOFF = 64, 10.0, 0.97
 EDGE = _HALF_TAPS + 4
 """Samples at each end at which the signal is not interpolated."""
 _CHUNK = 1 << 18
+"""Samples that one spline covers; a longer signal has one per `_BLOCK`, of which the last `_MAX_KEPT` are kept."""
+_BLOCK, _MAX_KEPT = 1 << 16, 16
 _SEGMENT, _MIN_SIGNAL_TO_NOISE = 512, 4.0
 """Samples of a spectrum, and its power over that of noise from which it contains a signal."""
 _MAX_RATE_PART, _SPLIT_TAPS = 0.9, 513
@@ -42,7 +44,8 @@ class Sampled:
     def __init__(self, values: np.ndarray, first_s: float, rate_hz: float) -> None:
         """Store even samples, shape (n,), with the time of the first one [s]."""
         self._values, self._first_s, self._rate_hz = values, first_s, rate_hz
-        self._kept: tuple[int, int, Any] | None = None
+        self._size = len(values) if len(values) <= _CHUNK else _BLOCK
+        self._kept: dict[int, Any] = {}
         last_s = first_s + (len(values) - 1) / rate_hz
         self.span_s = (first_s + EDGE / rate_hz, last_s - EDGE / rate_hz)
 
@@ -50,14 +53,11 @@ class Sampled:
         """Return values and slopes as `Stimulus` does."""
         at = (times_s - self._first_s) * self._rate_hz
         values, slopes = np.empty(len(at)), np.empty(len(at))
-        for begin in range(0, len(at), _CHUNK):
-            part = slice(begin, begin + _CHUNK)
-            low, high = 0, len(self._values)
-            if high > _CHUNK:
-                low = max(0, int(at[part].min()) - EDGE)
-                high = min(high, int(at[part].max()) + EDGE + 1)
-            spline = self._spline(low, high)
-            place = (at[part] - low) * _RATIO
+        blocks = np.clip(at // self._size, 0, (len(self._values) - 1) // self._size)
+        for block in np.unique(blocks).astype(int).tolist():
+            part = blocks == block
+            place = (at[part] - max(0, block * self._size - EDGE)) * _RATIO
+            spline = self._spline(block)
             values[part] = spline(place)
             slopes[part] = spline(place, nu=1) * (_RATIO * self._rate_hz)
         return values, slopes
@@ -67,17 +67,20 @@ class Sampled:
         at = np.rint((times_s - self._first_s) * self._rate_hz).astype(int)
         return self._values[np.clip(at, 0, len(self._values) - 1)]
 
-    def _spline(self, low: int, high: int) -> Any:
-        """Return a spline of some of the samples, by their place at four times the rate, kept until the next call."""
+    def _spline(self, block: int) -> Any:
+        """Return the spline of a block and its margins, by place at four times the rate from its first sample."""
         from scipy.interpolate import make_interp_spline
         from scipy.signal import firwin, upfirdn
 
-        if self._kept is None or self._kept[:2] != (low, high):
+        if block not in self._kept:
+            low, high = max(0, block * self._size - EDGE), (block + 1) * self._size + EDGE + 1
             window = cast(Any, ("kaiser", _KAISER))
             taps = firwin(2 * _HALF_TAPS * _RATIO + 1, _CUTOFF / _RATIO, window=window) * _RATIO
             finer = upfirdn(taps, self._values[low:high], up=_RATIO)[_HALF_TAPS * _RATIO : -_HALF_TAPS * _RATIO or None]
-            self._kept = low, high, make_interp_spline(np.arange(len(finer)), finer, k=5)
-        return self._kept[2]
+            if len(self._kept) == _MAX_KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[block] = make_interp_spline(np.arange(len(finer)), finer, k=5)
+        return self._kept[block]
 
 
 def remove_noise(values: np.ndarray, noise: float) -> np.ndarray:

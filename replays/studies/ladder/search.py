@@ -317,10 +317,11 @@ def _lower_each(work: _Search, standard: _Reference, keep: tuple[str, ...]) -> d
     top = work.cost(full)
     steps.append(standard.step("full", "full model", standard.reference, Errors(total=standard.errors), cost=top))
     passing: dict[str, dict[str, float]] = {}
+    number, total = 0, sum(choices.index(full.model[level]) for level, choices in LEVELS.items())
     for level, choices in LEVELS.items():
         for choice in choices[: choices.index(full.model[level])]:
-            lowered = full.with_model(**{level: choice})
-            work.progress(f"{level} {choice}")
+            lowered, number = full.with_model(**{level: choice}), number + 1
+            work.progress(f"{level} {choice}, level {number} of {total}")
             converged = work.run(settings.converged(lowered), runs=1)
             cost = work.cost(lowered)
             part = 1.0 - cost.cpu_s / top.cpu_s
@@ -388,10 +389,11 @@ def _restore_levels(
             return work.assign_engine(both[0])
         return both[0].with_engine(setting.engine, setting.step_us, setting.tolerance)
 
-    for level in list(chosen):
+    levels = list(chosen)
+    for n, level in enumerate(levels, 1):
         for choice in (None, *reversed(_fuller_choices(single, chosen, level))):
             fuller = _raise_level(chosen, level, choice)
-            work.progress(f"what {level} {chosen[level]} saves")
+            work.progress(f"saving by {level} {chosen[level]}, {n} of {len(levels)}")
             part = work.compute_saving(combine(chosen, fuller), combine(fuller, chosen))
             if part <= MIN_SAVING:
                 chosen = fuller
@@ -409,13 +411,14 @@ def _search_engines(work: _Search, standard: _Reference, best: Measurement) -> t
     """
     passing: list[tuple[Rung, int]] = []
     complete = True
-    for place, (engine, step_settings) in enumerate(settings.list_settings(work.scene, best.candidate).items()):
+    engines = settings.list_settings(work.scene, best.candidate)
+    for place, (engine, step_settings) in enumerate(engines.items()):
         for step_us, tolerance in step_settings:
             if work.left_s <= _VERIFICATION_SHARE * work.budget_s and passing:
                 complete = False
                 break
             candidate = best.candidate.with_engine(engine, step_us, tolerance)
-            work.progress(candidate.method)
+            work.progress(f"{candidate.method}, engine {place + 1} of {len(engines)}")
             # A run much longer than the reference may be a stall; the finest of small fixed steps takes five times as
             # long.
             limit_s = max(1.0, 10.0 * standard.reference.cpu_s * work.scene.duration_s)

@@ -11,9 +11,11 @@ from rig.base.errors import InputError, UnknownNameError, Words
 from rig.channels.faults import KINDS, BlockFault
 from rig.cli.connections.connection import Connection, show
 from rig.cli.groups import panel
-from rig.cli.output.tables import Form, echo, echo_json, new_table
+from rig.cli.output.tables import Form, echo, echo_json, new_table, table_console
 from rig.run.commands.channel import check_fault
 
+_LIST_WIDTH = 120
+"""Width of the list of kinds in a pipe, as its texts are sentences [characters]."""
 _parameters = panel("Parameters of the kinds")
 _TEXTS = (
     "factor: Factor of sensitivity or noise", "ramp_s: Time to the full effect in s",
@@ -127,4 +129,4 @@ def _show_kinds(channel: str | None, form: Form) -> None:
     table_shown = new_table("", *headings, wrapped=("effect", "parameters"), spare=("transports", "channels", "stage"))
     for row in rows:
         table_shown.add_row(*row)
-    form.console().print(table_shown)
+    table_console(wide=form.wide, pipe_width=_LIST_WIDTH).print(table_shown)

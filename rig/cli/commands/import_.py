@@ -250,7 +250,7 @@ def _common_lines(conversion: Conversion) -> list[str]:
     for channel in conversion.channels:
         # A count size from the source differs between channels and is stored in the recording.
         rule = channel.counts.split(",")[0] if "," in channel.counts else "a power of two of the unit"
-        for text in (f"{channel.rate_hz:.9g} Hz, {channel.time}", f"one count: {rule}"):
+        for text in (f"{channel.rate_hz:.9g} Hz, {channel.time}", f"step of the stored counts: {rule}"):
             done.setdefault(text, []).append(channel.name)
     whole = len(conversion.channels)
     return [f"{'all' if len(names) == whole else ', '.join(names)}: {text}" for text, names in done.items()]

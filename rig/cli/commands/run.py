@@ -93,7 +93,8 @@ def _words(status: dict[str, Any]) -> list[str]:
     end_s, spin_hz = status["end_s"], status["spin_hz"]
     end = "" if end_s is None else f" of {end_s:g}"
     spin = [] if spin_hz is None else [f"spin {spin_hz:.2f} Hz"]
-    return [f"{status['time_s']:7.2f}{end} s", *spin, f"x{status['real_time_factor']:.4f}", lateness_text(status)]
+    pace = f"x{status['real_time_factor']:.4f} real time"
+    return [f"{status['time_s']:7.2f}{end} s", *spin, pace, lateness_text(status)]
 
 
 def _print_summary(summary: dict[str, Any]) -> None:

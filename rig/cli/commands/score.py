@@ -14,6 +14,7 @@ from rig.base.text import replace_nonfinite
 from rig.cli.connections.connection import Connection
 from rig.cli.groups import panel
 from rig.cli.options import Channels, Force, Wide, split_names
+from rig.cli.output.progress import reporting
 from rig.cli.output.provenance import origin
 from rig.cli.output.tables import echo, make_printable, new_table, table_console
 
@@ -109,7 +110,11 @@ def score(
     if live:
         card = _judge_live(connection, _FOR_S if for_s is None else for_s, score_limits, method, due, mapped)
     else:
-        card = judge(file, against or [], limits=score_limits, path=method, channels=due, mapping=mapped)
+        with reporting() as reporter:
+            card = judge(
+                file, against or [], limits=score_limits, path=method, channels=due, mapping=mapped,
+                step=reporter.step, report=reporter.note,
+            )  # fmt: skip
     if output is not None:
         from replays.score.report import make_report
 
@@ -141,7 +146,6 @@ def _judge_live(
 
     from replays.score.judgement import judge
     from replays.score.records.live import MAX_STRETCH_S, MIN_STRETCH_S, collect
-    from rig.cli.output.progress import reporting
     from rig.cli.signals import stop_on_signals
 
     if not MIN_STRETCH_S <= for_s <= MAX_STRETCH_S:
@@ -152,17 +156,18 @@ def _judge_live(
     with tempfile.TemporaryDirectory(prefix="rig-score-") as folder:
         with connection.client() as client, reporting() as reporter, stop_on_signals(stopped.set):
             collected = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, report=reporter.part)
-        card = judge(
-            collected.file, [collected.session], limits=limits, path=path, arrivals=collected.arrivals,
-            channels=channels, mapping=mapping,
-        )  # fmt: skip
+        with reporting() as reporter:
+            card = judge(
+                collected.file, [collected.session], limits=limits, path=path, arrivals=collected.arrivals,
+                channels=channels, mapping=mapping, step=reporter.step, report=reporter.note,
+            )  # fmt: skip
     card.title = f"standard input, compared with the rig at {connection.connect}"
     card.remarks[:0] = collected.remarks
     return card
 
 
 def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
-    from replays.score.card.scorecard import FAIL, INCONCLUSIVE, make_matrix
+    from replays.score.card.scorecard import FAIL, INCONCLUSIVE, LEGEND, make_matrix
 
     console.print(make_printable(f"{card.title}, limits {card.limits}"))
     console.print(make_printable(card.verdict_line))
@@ -175,7 +180,7 @@ def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
             cells = "".join(f" {mark:1}" for mark in marks)
             console.print(make_printable(f"{quantity:<22}{cells}".rstrip()))
     if lines:
-        console.print("+ pass, X fail, ? inconclusive\n")
+        console.print(f"{LEGEND}\n")
     for line in (*card.evidence_gaps[1:], *card.findings):
         console.print(make_printable(line))
     table = new_table(

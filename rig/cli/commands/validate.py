@@ -95,10 +95,10 @@ def _show(result: Validation, console: Console) -> None:
         console.print(f"calibration: {result.calibration_line}")
     if result.bit_exact and not result.declared:
         return
-    if result.explained is not None and any(_counts(item) for item in result.explained.ranked):
+    if result.explained is not None and any(_counts(item, result.explained) for item in result.explained.ranked):
         console.print()
         console.print(_explanations(result.explained))
-        console.print("left: RMS of the remaining residual over the noise; 1 is noise alone")
+        console.print("residual: RMS of the remaining residual over the noise; 1 is noise alone")
     begin, end = result.window_s
     console.print(f"\ntrajectory from {begin:.4f} to {end:.4f} s: {result.window_reason}\n")
     console.print(_trajectory(result))
@@ -108,9 +108,12 @@ def _show(result: Validation, console: Console) -> None:
         console.print()
     if result.statistics:
         console.print(_statistics(result))
+        console.print(result.legend(lambda unit, name: unit == "1" or name.startswith("ripple")))
 
 
 def _trajectory(validation: Validation) -> Table:
+    from replays.recordings.validation.trajectory import PULSES_ONLY
+
     headings = ("channel", ">noise", ">RMS", ">limit", ">largest", ">drift", ">first at", "verdict")
     table = new_table("Trajectory: residual over the channel's own noise", *headings)
     for item in validation.residuals:
@@ -122,7 +125,7 @@ def _trajectory(validation: Validation) -> Table:
             f"{item.peak:.2f}",
             f"{item.drift:.2f}",
             "" if item.first_s is None else f"{item.first_s:.4f} s",
-            _VERDICTS[item.good],
+            _VERDICTS[item.good] + (PULSES_ONLY if item.pulses else ""),
         )
     return table
 
@@ -136,25 +139,26 @@ def _truth(validation: Validation) -> Table:
 
 
 def _statistics(validation: Validation) -> Table:
+    from replays.recordings.validation.statistics import NOT_JUDGED
+
     table = new_table("Phases", "phase", "quantity", ">recorded", ">predicted", ">limit", "verdict")
     for item in validation.statistics:
         limit = "" if item.limit is None else f"± {item.limit:.2g}"
-        table.add_row(
-            item.phase, item.title, f"{item.recorded:.6g}", f"{item.foretold:.6g}", limit, _VERDICTS[item.good]
-        )
+        verdict = NOT_JUDGED if item.too_wide else _VERDICTS[item.good]
+        table.add_row(item.phase, item.title, f"{item.recorded:.6g}", f"{item.foretold:.6g}", limit, verdict)
     return table
 
 
-def _counts(item: Explanation) -> bool:
-    return item.explained >= _MIN_EXPLAINED
+def _counts(item: Explanation, of: Explained) -> bool:
+    return item.explained >= _MIN_EXPLAINED or item.name in of.best
 
 
 def _explanations(explained: Explained) -> Table:
     headings = ("kind", "candidate", "change", ">explained", ">residual", ">fitted to", "verdict")
     title = "Candidate explanations of the difference, each alone"
     table = new_table(title, *headings, wrapped=["change"], spare=("kind", "fitted to"))
-    for one in [one for one in explained.ranked if _counts(one)][:12]:
+    for one in [one for one in explained.ranked if _counts(one, explained)][:12]:
         verdict = "named" if one.name in explained.best else ""
-        row = (one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s", verdict)
+        row = (one.kind, one.name, one.change, one.part, f"{one.left:.3g}", f"{one.to_s:.3f} s", verdict)
         table.add_row(*row)
     return table

@@ -56,6 +56,13 @@ class Reporter:
             self.done = percent - 1
             self.step(text)
 
+    def note(self, text: str) -> None:
+        """Print a line that remains."""
+        if self.bar is None:
+            echo(text, err=True)
+        else:
+            self.bar.console.print(printable(text), markup=False, highlight=False)
+
     def show_activity(self, text: str) -> None:
         """Show the current activity."""
         self.activity = text

@@ -155,7 +155,7 @@ class Table:
                     parts = {at: texts[row] if row < len(texts) else Text() for at, texts in wrapped.items()}
                     lines.append(self._line(parts, widths, style))
         if omitted := [heading for at, heading in enumerate(self.headings) if all(at not in block for block in blocks)]:
-            lines += Text(f"without {', '.join(omitted)}: see --wide", "dim").wrap(console, room)
+            lines += Text(f"columns left out: {', '.join(omitted)} (shown with --wide)", "dim").wrap(console, room)
         for line in lines:
             line.rstrip()
             yield from line.render(console)
@@ -269,7 +269,7 @@ def fact_table(title: str, rows: Iterable[tuple[str, str]], **styles: str) -> Ta
     return table
 
 
-def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
+def table_console(*, wide: bool = False, stderr: bool = False, pipe_width: int = _PIPE_WIDTH) -> Console:
     """Return the console for tables: they fit a terminal, and have full length in a pipe.
 
     Strings are printed without markup; styles need a `rich.text.Text` or a style argument.
@@ -277,6 +277,7 @@ def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
     Args:
         wide: Print on a terminal as in a pipe.
         stderr: Print to stderr.
+        pipe_width: Width in a pipe [characters].
     """
     from rich.console import Console
     from rich.segment import Segment
@@ -300,7 +301,7 @@ def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
                     yield Segment(_lines(segment.text.replace(_NO_BREAK, " ")), segment.style)
 
     terminal = (sys.stderr if stderr else sys.stdout).isatty()
-    width = None if terminal and not wide else _PIPE_WIDTH
+    width = _PIPE_WIDTH if wide else None if terminal else pipe_width
     return Screen(width=width, highlight=False, markup=False, emoji=False, stderr=stderr)
 
 

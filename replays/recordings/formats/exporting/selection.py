@@ -214,7 +214,7 @@ class Selection:
         title = f" ({printable(str(scene['title']))})" if scene.get("title") else ""
         seed = f", seed {about['seed']}" if about["seed"] else ""
         return "\n".join([
-            f"Virtual rotor-stator rig, scene {about['scene']}{title}, parameters {about['parameter_set']}{seed}",
+            f"Virtual rotor-stator rig, scene {about['scene']}{title}, parameter set {about['parameter_set']}{seed}",
             f"Time 0 is {about['start']}; from the recording {about['recording']}; sensors in {about['values']} values",
             *(f"{name}: {text}" for name, text in self.notes.items()),
         ])  # fmt: skip

@@ -24,7 +24,7 @@ _COLOURS = {"sure": BLUE, "likely": BLUE, "ask": RED}
 
 @house_style()
 def draw(guesses: Sequence[Guess], path: Path) -> None:
-    """Draw each signal, whole and in detail where it moves most, with its guessed channel; red: to be checked.
+    """Draw each signal, whole and in the window where most signals move, with its guessed channel; red: to be checked.
 
     Raises:
         InputError: The file is neither .png nor .svg.
@@ -34,17 +34,15 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
     axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2, 1))
     zero_s = min(guess.features.axis.first_s for guess in shown)
     end_s = max(guess.features.axis.last_s for guess in shown) - zero_s
+    window = _find_window([(guess.features.axis.instants() - zero_s, guess.features.values) for guess in shown], end_s)
     for (whole, close), guess in zip(axes, shown, strict=True):
         times, values = guess.features.axis.instants() - zero_s, guess.features.values
         colour = _COLOURS.get(guess.confidence, BLACK)
         whole.plot(*reduce_samples(times, values), color=colour, lw=0.9)
-        length = min(len(values), max(_MIN_DETAIL_SAMPLES, round(_DETAIL_S * guess.features.axis.rate_hz)))
-        starts = np.arange(0, len(values) - length + 1, max(1, length // 2))
-        start = max(
-            starts.tolist(), key=lambda at, values=values, length=length: float(np.ptp(values[at : at + length]))
-        )
-        part = slice(start, start + length)
+        part = slice(*np.searchsorted(times, window))
         close.plot(times[part], values[part], color=colour, lw=0.9)
+        close.set_xlim(window)
+        close.tick_params(labelbottom=whole is axes[-1, 0])
         target = f"{guess.channel} ({guess.confidence})" if guess.channel else "a channel of its own"
         whole.set_title(f"{axis_label(guess.entry.name, guess.entry.unit or 'no unit')} \N{RIGHTWARDS ARROW} {target}")
         whole.set_xlim(0.0, end_s)
@@ -52,6 +50,24 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
     for ax in axes[-1]:
         ax.set_xlabel("time from the first sample [s]")
     save(figure, path)
+
+
+def _find_window(signals: Sequence[tuple[np.ndarray, np.ndarray]], end_s: float) -> tuple[float, float]:
+    """Return the window of the detail view in which the signals move most, each relative to its range [s]."""
+    fastest_s = min(
+        (float(times[-1] - times[0]) / (len(times) - 1) for times, _ in signals if len(times) > 1), default=0.0
+    )
+    length_s = min(end_s, max(_DETAIL_S, _MIN_DETAIL_SAMPLES * fastest_s))
+    starts = np.arange(0.0, max(end_s - length_s, 1e-9), max(0.5 * length_s, 1e-9))
+    moves = np.zeros(len(starts))
+    for times, values in signals:
+        size = float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
+        places = zip(*(np.searchsorted(times, starts + off_s) for off_s in (0.0, length_s)), strict=True)
+        for n, (first, last) in enumerate(places):
+            if size > 0.0 and np.isfinite(part := values[first:last]).any():
+                moves[n] += float(np.nanmax(part) - np.nanmin(part)) / size
+    start_s = float(starts[int(np.argmax(moves))])
+    return start_s, start_s + length_s
 
 
 def reduce_samples(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

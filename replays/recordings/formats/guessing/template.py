@@ -87,6 +87,8 @@ def _text(sources: Sequence[Source], attached: dict[Path, Attachments], guesses:
             lines += [f"highpass_hz = {channel.highpass_hz!r}"] * bool(channel.highpass_hz)
         elif each.features.timed and corner_hz > (max_hz := 0.5 * each.features.axis.rate_hz):
             lines += [f"bandwidth_hz = {max_hz:.6g}    # {CHECK}: half of its rate; [defaults] is higher"]
+        elif each.channel == "speed":
+            lines += [f"# bandwidth_hz = HZ    # {CHECK}: a tachometer is often slower than the other channels"]
     lines += _event_tables(guesses, several=len(sources) > 1)
     first, about = sources[0].path, attached[sources[0].path]
     if about.experiment:
@@ -203,7 +205,7 @@ def _example_table(table: str, guesses: Sequence[Guess]) -> list[str]:
         force = "force and length assumed" if hit.pulse is None else "time, force and length from the probes"
         new_lines["commands"] = f"commands = [{format_command(hit)}]    # {CHECK}: no hammer pulse, but {at}: {force}"
     elif not has_pulses:
-        new_lines["scene"] = 'scene = "stable-run"                # a name of `rig scenes`, or a file'
+        new_lines["scene"] = 'scene = "stable-run"                # a log without impact; see `rig scenes`, or a file'
         new_lines["commands"] = (
             "commands = []                       # no hammer pulse was found; example: "
             '[{ at_s = 0.8, command = "hammer", force_n = 100, duration_ms = 5 }]'

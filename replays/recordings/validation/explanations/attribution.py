@@ -423,14 +423,14 @@ def _fit_model(
     stages: list[_WindowStage] = []
     for end_s in ends:
         fits: dict[str, Fit] = {}
-        for name, p in places.items():
-            step(f"{name}, to {end_s:.3f} s")
+        for n, (name, p) in enumerate(places.items(), 1):
+            step(f"{name}, {n} of {len(places)}, to {end_s:.3f} s (window {len(stages) + 1} of {len(ends)})")
             result = candidates[name].fit(p, end_s)
             if result is not None:
                 fits[name] = result
         if not stages and not any(is_noise(result.residuals) for result in fits.values()):
-            for name in places:
-                step(f"{name}, wider search")
+            for n, name in enumerate(places, 1):
+                step(f"{name}, {n} of {len(places)}, wider search")
                 far = candidates[name].search(end_s)
                 if far is not None and (name not in fits or far.squares < fits[name].squares):
                     fits[name] = far

@@ -84,6 +84,11 @@ class Explanation:
         return defects_in(self.channels_and_defect[1] or self.change) if self.kind == "sensor" else ()
 
     @property
+    def part(self) -> str:
+        """Explained part as text."""
+        return f"{self.explained:.2%}" if self.explained >= 1e-4 else "< 0.01%"
+
+    @property
     def at_floor(self) -> bool:
         """True if the remaining residual is noise."""
         return _is_noise_sum(self.squares, self.n)

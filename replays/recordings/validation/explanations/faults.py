@@ -90,11 +90,10 @@ def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lam
         if pair is not None:
             faults.append(pair)
             names |= {a.name, b.name}
-    alone = []
-    for name, one in off.items():
-        if name not in names:
-            step(f"faults of {name}")
-            alone.append(_explain_channel(one, explain))
+    alone, singles = [], [one for name, one in off.items() if name not in names]
+    for n, one in enumerate(singles, 1):
+        step(f"faults of {one.name}, {n} of {len(singles)}")
+        alone.append(_explain_channel(one, explain))
     return faults + _merge_equal(alone, explain, [one.name for one in shown if one.moves])
 
 

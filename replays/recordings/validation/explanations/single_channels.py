@@ -91,7 +91,10 @@ def own_faults(
         if one.sure and len(its) == 1 and its[0].name in ends:
             step(f"{its[0].name} at its end")
             later = law_of(ends[its[0].name]())
-            if one.name != f"{its[0].name} {later.name}":
+            common = [name for name in alternatives(one.channels_and_defect[1]) if name in alternatives(later.name)]
+            if common:
+                one = replace(one, name=f"{its[0].name} {' or '.join(common)}")
+            elif one.name != f"{its[0].name} {later.name}":
                 one = replace(one, sure=False, change=f"{one.change}, and at its end {later.name} {later.change}")
         # In so short a time, a held value matches almost any law, except for one that matches each count.
         one = replace(one, sure=one.sure and (end - begin > _MAX_DELAY_S or one.squares == 0.0))
@@ -173,7 +176,8 @@ def make_signal_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
     faults = []
     for one in own:
         names, what = one.channels_and_defect
-        text = one.change if one.sure else f"by no known law; closest is {what} {one.change}"
+        rest = f"({one.left:.2g} times the noise is left)"
+        text = one.change if one.sure else f"by no known law; closest is {what} {one.change} {rest}"
         what, text = (what if one.sure else "differs", f"{text}, ") if what else (one.change, "")
         text += f"from {one.from_s:.4f} to {one.to_s:.4f} s"
         faults.append(SignalFault(names, what, one.from_s, one.to_s, text))
