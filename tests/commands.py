@@ -30,7 +30,7 @@ def check_legible(table: Table, *, width: int = TERMINAL) -> None:
     lines = render_lines(table, width=width)
     assert max(map(cell_len, lines), default=0) <= width, lines
     text = "\n".join(lines)
-    note = re.search(r"^columns left out: (.*) \(shown with --wide\)\Z", text, re.MULTILINE | re.DOTALL)
+    note = re.search(r"^columns left out: (.*)\s\(shown\swith\s--wide\)\Z", text, re.MULTILINE | re.DOTALL)
     hidden_columns = set(" ".join(note[1].split()).split(", ")) if note else set()
     assert hidden_columns <= {table.headings[at] for at in table.spare}
     for at, heading in enumerate(table.headings):

@@ -67,7 +67,7 @@ LOGS = {
     "m.mf4": foreign.write_mdf, "t.tdms": foreign.write_tdms, "g.csv": foreign.write_german_csv,
     "c.csv": foreign.write_nameless_csv,
 }  # fmt: skip
-LINES_TO_CHECK = {"m.mf4": 1, "t.tdms": 4, "g.csv": 1, "c.csv": 5}
+LINES_TO_CHECK = {"m.mf4": 2, "t.tdms": 4, "g.csv": 2, "c.csv": 6}
 """Lines to check: filters of all; which probe is x, and pulses per turn; the side of nameless forces."""
 
 

@@ -149,7 +149,7 @@ def test_any_table_is_legible(width: int) -> None:
         table.add_row(f"name_{n}", "m/s^2", *numbers, "words " * 20 * n, "somebody, some Journal 12 (1999) 345")
     table.add_row("all of them")
     check_legible(table, width=width)
-    notes = [line for line in render_lines(table, width=width) if line.startswith("without ")]
+    notes = [line for line in render_lines(table, width=width) if line.startswith("columns left out: ")]
     assert notes == ([] if width == 300 else ["columns left out: unit, source (shown with --wide)"])
 
 
