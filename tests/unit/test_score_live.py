@@ -151,7 +151,7 @@ def full(_: Deliverer, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("how", "kind", "told"),
+    ("how", "kind", "message"),
     [(nobody, ConnectionError, "no reply"), (silent, InputError, "in 0.1 s"), (full, RefusedError, "No space left")],
 )
 def test_errors_during_a_live_run_are_reported(

@@ -85,7 +85,7 @@ def fit_line(result: Identification) -> str:
     """Return the goodness of the fit."""
     judgement = result.judgement
     line = f"chi2 {judgement.chi2:.4g} per degree of freedom ({judgement.dof}); {judgement.verdict}"
-    lead_s = first_command_s(found.question.experiment) - found.from_s
+    lead_s = first_command_s(result.question.experiment) - result.from_s
     if judgement.fits and judgement.chi2 < MIN_CHI2 and 0.0 < lead_s < _MIN_LEAD_S:
         line += f"; only {1e3 * lead_s:.0f} ms before the hammer pulse show the noise: record at least 0.5 s"
     if judgement.fits and judgement.inflation > 1.1:
