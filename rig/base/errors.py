@@ -67,7 +67,8 @@ def such_as(must: str, name: object, known_names: Iterable[str]) -> str:
     known_names = list(dict.fromkeys(known_names))
     shown = find_similar(name, known_names) or known_names[:_MAX_NAMES]
     more = f" ({len(known_names)} in all)" if len(known_names) > len(shown) else ""
-    return f"{must}, such as {', '.join(shown)}{more}" if shown else must
+    listed = all(one in must for one in shown)
+    return must if listed else f"{must}, such as {', '.join(shown)}{more}"
 
 
 class RefusedError(InputError):

@@ -93,7 +93,13 @@ def test_submitted_results_of_an_engine_equal_its_own_point(tmp_path: Path) -> N
     (tmp_path / "right.csv").write_text(
         make_results(problem.times, states, solver="right", cpu_s="0.5"), encoding="utf-8"
     )
-    session.add_solvers(folder, [tmp_path / "right.csv"])
+    again_added = session.add_solvers(folder, [tmp_path / "right.csv"])
+    drawn = "chart.png and chart-exact.png"  # the only phase is the main one
+    assert re.fullmatch(
+        rf"right, 1e-4, {PHASE}: error \S+, 0\.1 times real time, \d+ of \d+ contacts.*; drawn in {drawn}",
+        again_added.added[0],
+    )
+    assert not (folder / "chart-work.png").exists(), "an added solver states no evaluations"
     again = {row["method"]: row for row in read_table(folder)}
     assert (again["right"]["cpu_s"], len(again)) == (0.5, len(rows))
 

@@ -163,3 +163,17 @@ def test_charts_refuse_a_wrong_law_before_measuring(
     assert ended.value.code == 2
     assert "contact.stiffness must be" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [tmp_path / "x.toml"]
+
+
+@pytest.mark.parametrize(
+    "others", [("--problem", "drop"), ("--add", "x.csv"), ("--panel", "exact"), ("--only", "whirl")]
+)
+def test_a_law_is_refused_where_a_chart_would_ignore_it(
+    others: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(law_scene, "TWELVE_SCENES", dict(TWELVE_SCENES))
+    (path := tmp_path / "x.toml").write_text(LAW)
+    with pytest.raises(SystemExit) as ended:
+        main(["chart", "--law", str(path), *others, "-o", str(tmp_path)])
+    assert ended.value.code == 2
+    assert "--law must be given with --panel scenes" in capsys.readouterr().err

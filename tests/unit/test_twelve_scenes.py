@@ -20,6 +20,7 @@ from replays.studies.chart.session import make_chart
 from replays.studies.chart.store import COLUMNS, KEY, read_table
 from replays.studies.common.run import Course
 from replays.studies.common.twelve_scenes import TWELVE_SCENES
+from rig.base.errors import InputError
 from rig.physics.engines.common.memory import CONTACTS
 from rig.physics.kernels.signals import COLUMN, N_ROW
 
@@ -145,7 +146,7 @@ def test_a_method_walks_to_each_target() -> None:
 
 def test_panel_of_one_short_scene_is_journalled_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("replays.report.canvas.png", lambda _figure, **_about: b"")
-    monkeypatch.setattr(session, "TWELVE_SCENES", ["hammer-6.2", "smoothed"])
+    monkeypatch.setattr(session, "TWELVE_SCENES", {name: TWELVE_SCENES[name] for name in ("hammer-6.2", "smoothed")})
     monkeypatch.setattr(session, "find_reference", lambda *_problem, **_options: None)  # peers take long to compile
 
     def chart() -> session.ChartOutcome:
@@ -166,4 +167,16 @@ def test_panel_of_one_short_scene_is_journalled_and_resumed(tmp_path: Path, monk
     assert {row["friction"] for row in table.values() if row["phase"] == "smoothed"} == {"smoothed"}
     assert (tmp_path / "chart-scenes.svg").stat().st_size > 500
     second = chart()
-    assert (second.measured, second.resumed) == (0, 2)
+    assert (second.measured, second.resumed, second.left) == (0, 12, 0)
+
+
+def test_only_takes_a_scene_of_the_panel() -> None:
+    assert (
+        session.select_points("smoothed", ["scenes"])
+        == session.select_points("smoothed", None)
+        == (["scenes"], None, "smoothed")
+    )
+    assert session.select_points("drop", ["scenes"])[2] == "drop"
+    assert session.select_points("drop", None)[1:] == ("drop", None), "a phase, if the panel is not given"
+    with pytest.raises(InputError, match=r"only must be one of hammer-3\.2, .*received 'x'"):
+        session.select_points("x", ["scenes"])

@@ -33,7 +33,7 @@ from replays.studies.common.twelve_scenes import TWELVE_SCENES
 from replays.studies.peers import PEERS, Setting
 from replays.studies.peers.common.problem import Problem, scaled_error
 from replays.studies.peers.common.reference import Reference, find_reference
-from rig.base.errors import InputError, SimulationError
+from rig.base.errors import InputError, SimulationError, UnknownNameError
 
 TOTAL_S = {"quick": 95.0, "full": 3300.0}
 """Wall time for all points without compilation [s]; remaining points are left to the next run."""
@@ -64,6 +64,8 @@ class ChartOutcome:
     left: int = 0
     """Points that were not measured for lack of time."""
     failures: int = 0
+    added: list[str] = field(default_factory=list)
+    """Line about each added file."""
     missing: list[str] = field(default_factory=list)
     """Libraries of peers that are not installed."""
     interrupted: bool = False
@@ -87,7 +89,7 @@ def make_chart(
     Args:
         folder: Folder for pictures and data.
         mode: Extent of the chart.
-        only: A single phase.
+        only: A single phase or, on the panel of the scenes, a single scene.
         panels: Panels; None for all.
         peers: Whether to include the peers.
         fresh: Delete earlier points.
@@ -99,14 +101,14 @@ def make_chart(
     Raises:
         InputError: If a choice is invalid, or the folder cannot be written.
     """
-    chosen, only = select(only, panels)
+    chosen, only, scene = select_points(only, panels)
     progress = progress or ChartProgress()
     store = Store(folder, fresh=fresh)
     contenders = competitors(peers=peers)
     if methods is not None:
         contenders = {name: contenders[name] for name in methods}
     outcome = ChartOutcome(outdated=store.outdated, missing=missing_peers() if peers else [])
-    work = _Work(store, contenders, mode, end_s)
+    work = _Work(store, contenders, mode, end_s, scene)
     try:
         _measure(work, chosen, only, outcome, progress)
     except KeyboardInterrupt:
@@ -127,6 +129,19 @@ def make_chart(
     return outcome
 
 
+def select_points(only: str | None, panels: list[str] | None) -> tuple[list[str], str | None, str | None]:
+    """Check a selection; return the panels, the phase, and the scene.
+
+    Raises:
+        InputError: Unknown phase, scene or panel, or no selected panel has the phase.
+    """
+    if only in TWELVE_SCENES and (panels == ["scenes"] or (panels is None and only not in PHASES)):
+        return ["scenes"], None, only
+    if only is not None and panels == ["scenes"]:
+        raise UnknownNameError("only", f"one of {', '.join(TWELVE_SCENES)}", only, TWELVE_SCENES)
+    return *select(only, panels), None
+
+
 def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | None = None) -> ChartOutcome:
     """Draw the table of an earlier chart again without measuring.
 
@@ -135,8 +150,8 @@ def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | Non
     """
     from replays.studies.chart.drawing.figure import draw
 
-    chosen, _ = select(only, panels)
-    rows = read_table(folder)
+    chosen, _, scene = select_points(only, panels)
+    rows = [row for row in read_table(folder) if scene in (None, row["phase"])]
     if not rows:
         raise InputError("output", "a folder with points in chart.csv", str(folder))
     files = draw(rows, folder, chosen, command=_command(rows[0]["mode"]))
@@ -155,7 +170,7 @@ def add_solvers(folder: Path, paths: list[Path], *, progress: ChartProgress | No
         InputError: If a file is invalid, or the chart was measured by other code.
         SimulationError: If no two codes solved the problem, so that there is no reference.
     """
-    from replays.studies.chart.drawing.figure import draw
+    from replays.studies.chart.drawing.figure import choose_main_phase, draw
 
     progress = progress or ChartProgress()
     added = [read_submission(path) for path in paths]
@@ -165,6 +180,7 @@ def add_solvers(folder: Path, paths: list[Path], *, progress: ChartProgress | No
         raise InputError("output", "a folder with a chart by this code, with its journal, or a new one", str(folder))
     mode: Mode = "full" if charted and charted[0]["mode"] == "full" else "quick"
     work = _Work(store, {}, mode, None)
+    points: list[Row] = []
     progress.begin(2 * len(added))
     for each in added:
         progress.step(f"reference of {each.phase}")
@@ -174,10 +190,26 @@ def add_solvers(folder: Path, paths: list[Path], *, progress: ChartProgress | No
             raise SimulationError(f"no two codes solved {each.phase}, so it has no reference")
         progress.step(f"{each.phase}: {each.contender.title}")
         base = work.base(PANEL, each.phase, "", each.contender, each.contender.settings[0])
-        work.keep({**base, "friction": "exact"}, each.point(reference))
+        points.append({**base, "friction": "exact", **each.point(reference)})
+        work.keep(points[-1], {})
     rows = store.rows(mode)
     files = store.write(mode) + draw(rows, folder, list(PANELS), command=_command(mode))
-    return ChartOutcome(files=files, measured=len(added), failures=sum(bool(row["failure"]) for row in rows))
+    main_phase = choose_main_phase(rows)
+    lines = [
+        f"{row['title']}, {row['rung']}, {row['phase']}: {_describe_point(row)}; drawn in "
+        f"{'chart.png and ' if row['phase'] == main_phase else ''}chart-exact.png"
+        for row in points
+    ]
+    failures = sum(bool(row["failure"]) for row in rows)
+    return ChartOutcome(files=files, measured=len(added), failures=failures, added=lines)
+
+
+def _describe_point(row: Row) -> str:
+    """Return error, speed, contacts and failure of a point in words."""
+    error = f"error {row['error']:.1e}" if row["error"] is not None else "no error"
+    failed = f", failed: {row['message']}" if row["failure"] else ""
+    contacts = f"{row['contacts']} of {row['contacts_reference']} contacts"
+    return f"{error}, {row['speed']:.2g} times real time, {contacts}{failed}"
 
 
 def _command(mode: str) -> str:
@@ -202,6 +234,8 @@ class _Work:
     contenders: dict[str, Competitor]
     mode: Mode
     end_s: float | None
+    scene: str | None = None
+    """The only one of the scenes to measure."""
     problems: dict[tuple[Any, ...], Problem] = field(default_factory=dict)
     references: dict[tuple[Any, ...], Reference | None] = field(default_factory=dict)
     compiled: dict[str, float] = field(default_factory=dict)
@@ -265,9 +299,10 @@ def _measure(work: _Work, panels: list[str], only: str | None, outcome: ChartOut
     windows = {(task.panel, task.phase, task.case) for task in tasks if task.panel != RUB}
     progress.begin(len(tasks) + len(windows) + sum(walks.values()))
     total = TOTAL_S[work.mode]
-    # The profile and the twelve scenes have their share of the time before the slow peers.
-    early = [task for task in tasks if work.contenders[task.method].ours]
-    late = [task for task in tasks if not work.contenders[task.method].ours]
+    # The profile and the twelve scenes have their share of the time after the main picture, before other peers.
+    main = ("exact", "whirl")
+    early = [task for task in tasks if work.contenders[task.method].ours or (task.panel, task.phase) == main]
+    late = [task for task in tasks if task not in early]
     for panel, phase, case in sorted(windows):
         if case != "smoothed":
             progress.step(f"reference of {panel}, {phase}")
@@ -340,7 +375,9 @@ def _point(work: _Work, task: Task, outcome: ChartOutcome, progress: ChartProgre
 def _walks(work: _Work) -> dict[str, tuple[dict[str, Callable[[], Problem]], tuple[float, ...]]]:
     """Return problems by phase, and targets, of each panel whose methods search their ladders."""
     draws = {f"scene-{seed:03d}": partial(profile.draw_problem, seed) for seed in range(profile.SCENES[work.mode])}
-    scenes = {name: partial(scene_problem, name, end_s=work.end_s) for name in TWELVE_SCENES}
+    scenes = {
+        name: partial(scene_problem, name, end_s=work.end_s) for name in TWELVE_SCENES if work.scene in (None, name)
+    }
     return {"profile": (draws, (profile.TARGET,)), "scenes": (scenes, SCENE_TARGETS)}
 
 
@@ -355,16 +392,16 @@ def _walk_ladders(work: _Work, panel: str, outcome: ChartOutcome, progress: Char
         rivals = [one for one in rivals if one.quick and one.name not in slow and one.family not in slow]
     budget = BUDGETS[work.mode]._replace(solve_s=1.0 if work.mode == "quick" else 5.0)
     for phase, make in problems.items():
-        progress.step(f"{panel}, {phase}")
+        progress.step(f"{panel}, {TWELVE_SCENES[phase].title if phase in TWELVE_SCENES else phase}")
         # The setting found is not part of the key: one point per scene, target and method.
         cases = {"" if panel == "profile" else f"{target:g}": target for target in targets}
         rows = [(one, case, work.base(panel, phase, case, one, None)) for one in rivals for case in cases]
         waiting = [(one, case, row) for one, case, row in rows if not work.store.has(row | {"rung": "cheapest"})]
+        outcome.resumed += len(rows) - len(waiting)
         if not waiting:
-            outcome.resumed += 1
             continue
         if time.perf_counter() > deadline + work.compile_s:
-            outcome.left += 1
+            outcome.left += len(waiting)
             continue
         problem = make()
         reference, reached = work.solve(problem), dict[str, str]()

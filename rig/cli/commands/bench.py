@@ -29,6 +29,7 @@ def bench(
     console.print(cases_table(report, runs=runs))
     if report["missing_peers"]:
         console.print(f"not timed: {', '.join(report['missing_peers'])} (pip install 'rotor-stator-rig[peers]')")
+    console.print("goals: times real time, at an error, for an idle machine; a loaded one may miss them")
     reference = report["reference"]
     doubt = "" if reference["error"] is None else f", which agree to {reference['error']:.0e}"
     console.print(f"error: RMS of 7 scaled states over 1 s against exact Coulomb by {reference['of']}{doubt}")
@@ -54,7 +55,7 @@ def cases_table(report: dict[str, Any], *, runs: int) -> Table:
     for case in report["cases"]:
         goal = "" if case["goal"] is None else f"{case['goal']:g}"
         if case["error_goal"] is not None:
-            goal += f" at {case['error_goal']:.1e}"
+            goal = f"{goal} at {case['error_goal']:.1e}" if goal else f"error {case['error_goal']:.1e}"
         verdict = {True: "yes", False: "NO", None: ""}[case["reached"]]
         table.add_row(
             case["name"], f"{case['median']:.1f}", f"{case['min']:.1f}", f"{case['max']:.1f}", f"{case['ratio']:.2f}",

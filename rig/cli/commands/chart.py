@@ -14,14 +14,16 @@ from rig.cli.output.tables import echo
 
 def chart(
     *,
-    quick: Annotated[bool, typer.Option("--quick", help="Measure few points, about 2 min (default)")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Stop after 2 min of measurement; repeat for the rest (default)")
+    ] = False,
     full: Annotated[bool, typer.Option("--full", help="Measure all points, up to 1 h")] = False,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder for pictures and data")
     ] = Path("chart"),
     only: Annotated[
         str | None,
-        typer.Option("--only", metavar="PHASE", help="Chart one phase: first-impacts, transient, whirl, ..."),
+        typer.Option("--only", metavar="NAME", help="Chart one phase, or one scene of --panel scenes"),
     ] = None,
     panel: Annotated[
         list[str] | None,
@@ -39,7 +41,11 @@ def chart(
     ] = None,
     draw: Annotated[bool, typer.Option("--draw", help="Redraw chart.csv of the folder without measuring")] = False,
 ) -> None:
-    """Chart speed against error of the rig's engines and other solvers, by phase of the motion and contact law."""
+    """Chart speed against error of the rig's engines and other solvers, by phase of the motion and contact law.
+
+    A quick chart stops after two minutes of measurement; compiling and reference solutions take several more. Run it
+    again until no points are left. --law acts on --panel scenes only; its name for --only is "law".
+    """
     from replays.studies.chart.session import ChartProgress, add_solvers, draw_again, make_chart
     from replays.studies.chart.submission import write_problem
     from replays.studies.common.law_scene import add_law_scene
@@ -49,15 +55,23 @@ def chart(
         raise InputError("--quick, --full", "one of the two", Words("both"))
     if sum((bool(add), problem is not None, any((quick, full, only, panel, no_peers, fresh, draw)))) > 1:
         raise InputError("--add or --problem", "the only option except --output", Words("more options"))
+    if law is not None:
+        if add or problem is not None or "scenes" not in (panel or ["scenes"]):
+            raise InputError("--law", "given with --panel scenes, on which alone it acts", Words("other options"))
+        name = add_law_scene(law)
+        if only == "law":
+            only, panel = name, ["scenes"]
+        elif only is not None and panel != ["scenes"]:
+            raise InputError("--law", "given with --panel scenes, on which alone it acts", Words(f"--only {only}"))
     if problem is not None:
-        echo(str(write_problem(problem, output)))
+        with reporting(compiles=True):
+            path = write_problem(problem, output)
+        echo(str(path))
         return
     if draw:
         for path in draw_again(output, only=only, panels=panel).files:
             echo(str(path))
         return
-    if law is not None:
-        add_law_scene(law)
     mode = "full" if full else "quick"
     with reporting(compiles=True) as reporter:
         reporter.show("references")
@@ -75,8 +89,11 @@ def chart(
     if outcome.outdated:
         echo(f"{outcome.outdated} points from an older version were measured again", err=True)
     unmeasured = f", {outcome.left} not measured within the time limit: run again to add them" if outcome.left else ""
-    counts = f"{outcome.measured} points measured, {outcome.resumed} kept, {outcome.failures} failures drawn"
+    what = "added" if add else "measured"
+    counts = f"{outcome.measured} points {what}, {outcome.resumed} kept, {outcome.failures} failures in the table"
     echo(counts + unmeasured, err=True)
+    for line in outcome.added:
+        echo(line)
     for path in outcome.files:
         echo(str(path))
     if outcome.interrupted:

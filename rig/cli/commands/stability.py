@@ -146,6 +146,7 @@ def _sweep(count: int, seed: int, only: str | None, engines: list[str], folder: 
 def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, form: Form) -> None:
     from replays.studies.common.journal import prepare_folder
     from replays.studies.stability.scenes.scene_atlas import (
+        OUTCOMES,
         SceneOutcome,
         draw_scene_atlas,
         is_silent,
@@ -168,6 +169,7 @@ def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, fo
         echo_json({"outcomes": [outcome.document() for outcome in runs], "pictures": [str(path) for path in pictures]})
     else:
         form.console().print(scenes_table(runs))
+        echo("\n" + "\n".join(f"{kind}: {text.removeprefix(f'{kind}: ')}" for kind, (_, text) in OUTCOMES.items()))
         for path in pictures:
             echo(f"picture  {path}")
     if interrupted:

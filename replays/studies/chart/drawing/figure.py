@@ -57,6 +57,8 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
         points = [row for row in rows if row["panel"] == panel]
         if panel not in panels or not any(row["family"] != "reference" for row in points):
             continue
+        if make is _work and all(row["family"] in (ADDED_FAMILY, "reference") for row in points):
+            continue
         figure = new_figure(layout=None)
         caption = make(figure, rows)
         _caption(figure, rows, caption, command, note)
@@ -98,7 +100,9 @@ _NOTE = (
 def _timing(rows: list[Row], panel: str) -> str:
     """Return remarks on points timed in another way: added by file, or driven by a Python loop."""
     added = {row["title"] for row in rows if row["panel"] == panel and row["family"] == ADDED_FAMILY}
-    stated = " Solvers added by file: time and number of contacts as their authors' files state." if added else ""
+    stated = (
+        " Solvers added by file: one run, time and number of contacts as their authors' files state." if added else ""
+    )
     led = sorted({row["method"] for row in rows if row["panel"] == panel and row["own_cpu_s"]})
     if not led:
         return stated
@@ -115,23 +119,34 @@ def _phases(rows: list[Row], panel: str) -> list[str]:
     return [phase for phase in PHASES if phase in measured]
 
 
-def _hero(figure: Any, rows: list[Row]) -> str:
+def choose_main_phase(rows: list[Row]) -> str:
+    """Return the phase that `chart.png` shows."""
     phases = _phases(rows, "exact")
-    phase = "whirl" if "whirl" in phases else phases[-1]
+    return "whirl" if "whirl" in phases else phases[-1]
+
+
+def _hero(figure: Any, rows: list[Row]) -> str:
+    phase = choose_main_phase(rows)
     chosen = _select(rows, "exact", phase)
-    grid = _grid(figure, 11.2, "Rotor-stator contact with Coulomb friction: how fast, and how true", down=2, across=1)
+    profile = [row for row in rows if row["panel"] == "profile"]
+    details = bool(profile) or any(row["energy_residual"] for row in chosen)
+    title = "Rotor-stator contact with Coulomb friction: how fast, and how true"
+    grid = _grid(figure, 11.2 if details else 8.0, title, down=1 + details, across=1)
     grid.set_width_ratios((1.0, 0.4))
-    grid.set_height_ratios((1.0, 0.47))
-    grid.update(hspace=0.22)
+    if details:
+        grid.set_height_ratios((1.0, 0.47))
+        grid.update(hspace=0.22)
     axes = figure.add_subplot(grid[0, 0])
     window(axes, chosen, rows, title=f"Speed against total error: {PHASES[phase].title}")
     mark_better(axes)
     label_lines(axes, chosen, rows)
-    draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 1]), smoothed=True)
+    draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 1]), smoothed=True, drawn=chosen + profile)
+    if not details:
+        return _NOTE + _timing(rows, "exact")
     below = grid[1, :].subgridspec(1, 2, wspace=0.21)
     draw_energy(figure.add_subplot(below[0, 0]), chosen, rows)
     right = figure.add_subplot(below[0, 1])
-    if any(row["panel"] == "profile" for row in rows):
+    if profile:
         draw_profile(right, rows)
     else:
         draw_frames(right, chosen, rows)
@@ -198,7 +213,9 @@ def _profile_figure(figure: Any, rows: list[Row]) -> str:
 
 def _scenes(figure: Any, rows: list[Row]) -> str:
     points = [row for row in rows if row["panel"] == "scenes"]
-    grid = _grid(figure, 11.7, "Twelve scenes: speed of each method at a given error", down=2, across=1, left=1.6)
+    scenes = len({row["phase"] for row in points})
+    number = "Twelve scenes" if scenes == 12 else "One scene" if scenes == 1 else f"{scenes} scenes"
+    grid = _grid(figure, 11.7, f"{number}: speed of each method at a given error", down=2, across=1, left=1.6)
     grid.set_width_ratios((1.0, 0.3))
     grid.update(wspace=0.3, top=0.88, bottom=0.135, hspace=0.38)
     for i, target in enumerate(SCENE_TARGETS):
@@ -212,14 +229,13 @@ def _scenes(figure: Any, rows: list[Row]) -> str:
 
 
 def _work(figure: Any, rows: list[Row]) -> str:
-    phases = _phases(rows, "exact")
-    phase = "whirl" if "whirl" in phases else phases[-1]
+    phase = choose_main_phase(rows)
     chosen = _select(rows, "exact", phase)
     grid = _grid(figure, 7.0, f"Work and frames, exact Coulomb friction ({PHASES[phase].title})")
     grid.update(wspace=0.3)
     draw_work(figure.add_subplot(grid[0, 0]), chosen, rows)
     draw_frames(figure.add_subplot(grid[0, 1]), chosen, rows)
-    draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 2]), failures=False, bounds=False)
+    draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 2]), failures=False, bounds=False, drawn=chosen)
     return (
         "Evaluations as each library counts them: a Taylor series' are its order times its steps. "
         "Worst frame: the longest call of 1 ms, each frame's least of several passes, "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+import textwrap
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -96,7 +97,7 @@ def draw_scenes(axes: Any, rows: list[Row], case: str) -> None:
             if bound := own_speed(row):
                 axes.plot(bound, place, **_style(row, rows) | {"mfc": "white", "mew": 0.8})
             axes.plot(row["speed"], place, gid=f"{row['method']}-{scene}", **_style(row, rows))
-    axes.set_yticks(range(len(scenes)), [TWELVE_SCENES[scene].title for scene in scenes])
+    axes.set_yticks(range(len(scenes)), [textwrap.fill(TWELVE_SCENES[scene].title, 22) for scene in scenes])
     axes.set_xticks([tick for tick in 10.0 ** np.arange(-4, 8) if low <= tick <= high])
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.minorticks_off()

@@ -14,6 +14,8 @@ Row = dict[str, Any]
 # Peers have muted colours by family, so that our engines stand out.
 _FAMILIES = {"heyoka": ("#111111", "*"), "SUNDIALS": ("#6e6e6e", "s"), "scipy": ("#a98a66", "o"),
              "MuJoCo": ("#a08cc0", "X"), ADDED_FAMILY: ("#7a8500", "P")}  # fmt: skip
+_ADDED_COLOURS = ("#7a8500", "#00796b", "#c2185b", "#5d4037", "#3949ab")
+"""Colours of added solvers, in turn."""
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)), (0, (2.5, 1)), (0, (8, 3)),
                             (0, (1, 3)), (0, (9, 2, 3, 2)))  # fmt: skip
 FAILURES = {
@@ -37,6 +39,8 @@ def point_style(row: Row, rows: list[Row]) -> dict[str, Any]:
     color, marker = _FAMILIES.get(row["family"], ("#999999", "d"))
     family = list(dict.fromkeys(other["method"] for other in rows if other["family"] == row["family"]))
     dash = _DASHES[family.index(row["method"]) % len(_DASHES)]
+    if row["family"] == ADDED_FAMILY:
+        color = _ADDED_COLOURS[family.index(row["method"]) % len(_ADDED_COLOURS)]
     strong = row["family"] in ("heyoka", ADDED_FAMILY)
     return {"color": color, "marker": marker, "ls": dash, "lw": 1.0, "ms": 7.5 if strong else 4.0, "mec": color,
             "mew": 0.5, "zorder": 5 if strong else 4}  # fmt: skip
@@ -57,12 +61,25 @@ def draw_legend(
     smoothed: bool = False,
     failures: bool = True,
     bounds: bool = True,
+    drawn: list[Row] | None = None,
 ) -> None:
-    """Draw the legend: our engines, then peers by family, then the marks."""
+    """Draw the legend: our engines, then peers by family, then the marks.
+
+    Args:
+        figure: Figure.
+        rows: The whole table, for styles that are equal on all panels.
+        panels: Panels of the picture.
+        place: Axes of the legend.
+        smoothed: Add the smoothed law.
+        failures: Add the kinds of failure.
+        bounds: Add the bounds of libraries.
+        drawn: Points of the picture; None for all of its panels.
+    """
     from matplotlib.lines import Line2D
 
     entries: list[tuple[Any, Any]] = []
-    shown = {row["method"]: row for row in rows if row["panel"] in panels and row["family"] != "reference"}
+    inside = [row for row in rows if row["panel"] in panels] if drawn is None else drawn
+    shown = {row["method"]: row for row in inside if row["family"] != "reference"}
     order = [RIG_FAMILY, ADDED_FAMILY, "heyoka", "SUNDIALS", "scipy", "MuJoCo"]
     blank = Line2D([], [], ls="none")
     headings = {RIG_FAMILY: "engines of the rig"}
