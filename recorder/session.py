@@ -463,6 +463,7 @@ class RecordingSession:
             dropped=self._inbox.dropped,
             malformed=in_files.malformed,
             size_bytes=sum(file.stat().st_size for file in files if file.exists()),
+            sha256=writer.sha256,
             files=files,
             removed=writer.removed,
             high_water_bytes=self._inbox.high_water,

@@ -115,6 +115,11 @@ class RecordingWriter:
         """Name of the file while it is being written."""
         return self._draft.part
 
+    @property
+    def sha256(self) -> str:
+        """SHA-256 digest of the written bytes."""
+        return self._draft.digest.hexdigest()
+
     def counts(self) -> Counts:
         """Return the totals up to now. Safe to call from any thread."""
         return self.tally.counts(size_bytes=self.file.size_bytes, safe_time_ns=self._safe_time_ns)

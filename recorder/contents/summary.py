@@ -51,6 +51,7 @@ class Summary:
         dropped: Payloads dropped because the inbox was full; included in the lost rows.
         malformed: Payloads that do not fit the format of their key; they are recorded unchanged.
         size_bytes: Size of the files [bytes].
+        sha256: Digest of the last finished file, as it was written; empty without one.
         files: All files in order, including a .part file that could not be finished.
         removed: Number of files removed to free disk space.
         high_water_bytes: Largest size of the inbox [bytes].
@@ -73,6 +74,7 @@ class Summary:
     dropped: int
     malformed: int
     size_bytes: int
+    sha256: str = ""
     files: tuple[Path, ...] = ()
     removed: int = 0
     high_water_bytes: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 from collections.abc import Iterator
@@ -52,7 +53,7 @@ class McapFile:
         self._schemas: dict[str, int] = {}
         self._topics: dict[str, tuple[int, Iterator[int], bool]] = {}
         """Channel number, sequence counter and whether messages are wrapped as text, by topic."""
-        self.mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
+        self.mcap = Writer(draft, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)  # type: ignore[arg-type]
         setattr(self.mcap, _CHUNK_LIST, _ChunkIndexes(draft.file))
         self.mcap.start(profile="ros2", library="rotor-stator-rig recorder")
 
@@ -109,7 +110,11 @@ class McapFile:
         Raises:
             OSError: The disk reports an error.
         """
-        self.mcap.finish()
+        self.draft.verify()
+        try:
+            self.mcap.finish()
+        except struct.error:  # the index is read from the file
+            raise OSError(errno.EIO, "the file was altered while it was being written") from None
         self.size_bytes = self.draft.sync()
         self.draft.finish()
 

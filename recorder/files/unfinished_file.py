@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import os
 import re
 from collections.abc import Iterable
@@ -73,8 +74,9 @@ class Draft:
 
     Attributes:
         path: Final name.
-        part: Current name; differs from the initial one if the file was removed and saved elsewhere.
+        part: Current name; differs from the initial one if the file was removed or replaced, and saved elsewhere.
         file: The open file.
+        digest: SHA-256 digest of the written bytes.
     """
 
     def __init__(self, path: Path, *, force: bool = False) -> None:
@@ -91,7 +93,7 @@ class Draft:
 
         check_destination(path, force=force)
         self.path, self.part = path, get_part_path(path)
-        self._force = force
+        self._force, self.digest = force, hashlib.sha256()
         try:
             if force and self.part.exists():
                 # Create a new file instead of truncating the old one, so that no other process has it open.
@@ -100,6 +102,19 @@ class Draft:
             fcntl.flock(self.file, fcntl.LOCK_EX)
         except OSError as error:
             raise InputError("output", "a file that can be written", Words(f"{self.part} ({error.strerror})")) from None
+
+    def write(self, data: bytes) -> int:
+        """Append bytes to the file."""
+        self.digest.update(data)
+        return self.file.write(data)
+
+    def tell(self) -> int:
+        """Return the position in the file [bytes]."""
+        return self.file.tell()
+
+    def flush(self) -> None:
+        """Pass all written bytes to the operating system."""
+        self.file.flush()
 
     def sync(self) -> int:
         """Flush to the disk and return the file size [bytes].
@@ -112,7 +127,7 @@ class Draft:
         os.fsync(self.file.fileno())
         # A removed file can still be written, but is lost when it is closed.
         if not os.fstat(self.file.fileno()).st_nlink:
-            self._save()
+            self._save("removed")
         return self.file.tell()
 
     def sync_folder(self) -> None:
@@ -135,24 +150,44 @@ class Draft:
         self.part.unlink(missing_ok=True)
 
     def finish(self) -> None:
-        """Close the flushed file and rename it to its final name.
+        """Rename the flushed file to its final name and close it.
 
         Raises:
-            OSError: The final name was taken by another process, or the disk reports an error.
+            OSError: The final name was taken by another process, the file was replaced by another one, or the disk
+                reports an error.
         """
-        self.file.close()
         if self.path.exists() and not self._force:
             raise FileExistsError(errno.EEXIST, f"{self.path} was created by another process meanwhile")
+        self.verify()
         self.part.replace(self.path)
+        if not self._is_at(self.path):  # replaced between the comparison and the renaming
+            self._save("replaced")
+        self.file.close()
 
-    def _save(self) -> None:
+    def verify(self) -> None:
+        """Raise an OSError if the file was replaced, or has another size than was written; it is then copied."""
+        self.file.flush()
+        if not self._is_at(self.part):
+            self._save("replaced")
+
+    def _is_at(self, path: Path) -> bool:
+        """Return whether a name leads to the open file, with the size that was written."""
+        with contextlib.suppress(OSError):
+            named = path.lstat()
+            return os.path.samestat(named, os.fstat(self.file.fileno())) and named.st_size == self.file.tell()
+        return False
+
+    def _save(self, what: str) -> None:
+        """Copy the open file to a free name, in its folder or the nearest existing parent, and raise an OSError."""
         part_path = self.part
         folder = next(folder for folder in part_path.absolute().parents if folder.is_dir())
         with contextlib.suppress(OSError):
             self.part = folder / part_path.name
+            if os.path.lexists(self.part):
+                self.part = folder / f"{self.path.stem}.saved{self.path.suffix}{PART_SUFFIX}"
             with self.part.open("xb") as copy:
                 position = 0
                 while data := os.pread(self.file.fileno(), 1 << 20, position):
                     copy.write(data)
                     position += len(data)
-        raise OSError(errno.ENOENT, f"{part_path} was removed while it was being written")
+        raise OSError(errno.ENOENT, f"{part_path} was {what} while it was being written")

@@ -50,6 +50,7 @@ class Sink(ABC):
         path: Name of the recording, ending in .mcap.
         tally: Counts of received data, recorded or not.
         files: Finished files in order.
+        sha256: Digest of the last finished file, as it was written.
         removed: Number of finished files removed to free disk space.
         ended: Limit that ended the recording; empty before.
         out_of_room: Whether that limit was disk space.
@@ -61,6 +62,7 @@ class Sink(ABC):
         self.path = path
         self.tally = Tally(needs.tick_rate_hz, from_start=from_start)
         self.files: list[Path] = []
+        self.sha256 = ""
         self.removed = 0
         self.ended = ""
         self.out_of_room = False
@@ -123,6 +125,7 @@ class Sink(ABC):
             return
         writer.finish(reason, notes=notes)
         self.files.append(writer.path)
+        self.sha256 = writer.sha256
         counts = writer.counts()
         self._room.finished_bytes += counts.size_bytes
         self._kept.append(counts)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shutil
+import stat
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,8 +27,10 @@ if TYPE_CHECKING:
 EVENT_MARGIN_S = 1.0
 """Simulated time that the evidence covers before and after an event [s]."""
 
-_MAX_EVIDENCE_BYTES = 100 << 20
-"""Largest size of a device's file that is kept as evidence."""
+MAX_FILES = 10_000
+"""Largest number of files that devices may leave in their folder."""
+MAX_KEPT_BYTES = 100_000_000
+"""Largest total size of the devices' files that are kept as evidence [bytes]."""
 
 
 class MeasurementError(AssertionError):
@@ -41,7 +45,9 @@ class Trial:
         id: Name of the test.
         evidence: Folder for evidence; None leaves it where the test ran.
         target: Rig or recording that the test runs on.
-        folder: Working folder, removed at the end unless it holds the evidence.
+        folder: Folder for the files of the devices under test, removed at the end.
+        records: Folder for the recording and the logs, which no device is told; removed at the end unless it holds the
+            evidence.
         settings: Settings of the bench.
         measurements: Judged values, in order.
         kept: Files of the evidence.
@@ -52,6 +58,7 @@ class Trial:
     evidence: Path | None = None
     target: Target = field(default_factory=Target)
     folder: Path = field(default_factory=lambda: Path(tempfile.mkdtemp(prefix="rig-")))
+    records: Path = field(default_factory=lambda: Path(tempfile.mkdtemp(prefix="rig-")))
     settings: BenchSettings | None = None
     bench: Bench | None = None
     devices: list[Device] = field(default_factory=list)
@@ -63,16 +70,35 @@ class Trial:
     troubles: list[str] = field(default_factory=list)
     floor_ms: tuple[float, float] | None = None
 
+    def __post_init__(self) -> None:
+        self._folder_entry = self.folder.lstat()
+
+    def has_folder(self) -> bool:
+        """Return whether the folder of the devices was neither removed nor replaced."""
+        with contextlib.suppress(OSError):
+            return os.path.samestat(self.folder.lstat(), self._folder_entry)
+        return False
+
+    def find_files(self) -> Iterator[Path]:
+        """Yield the entries of the devices' folder that are no folders, one more than is allowed at most."""
+        found = 0
+        for folder, _, names in os.walk(self.folder) if self.has_folder() else ():
+            for name in sorted(names):
+                yield Path(folder, name)
+                found += 1
+                if found > MAX_FILES:
+                    return
+
     def start_bench(self, settings: BenchSettings) -> Bench:
         """Start the bench and return it."""
         self.settings = settings
-        self.bench = Bench(settings, self.folder, self.target)
+        self.bench = Bench(settings, self.records, self.target)
         if self.bench.pace == "real-time":
             self.floor_ms = self.bench.floor_ms()
         return self.bench
 
     def start_device(
-        self, command: str | Sequence[str], *, name: str, where: Path, joins: bool | None = None
+        self, command: str | Sequence[str], *, name: str, where: Path, joins: bool | None = None, may_end: bool = False
     ) -> Device:
         """Start a device under test and return it once it has joined lockstep, or else once it is connected.
 
@@ -81,6 +107,7 @@ class Trial:
             name: Its name.
             where: Working directory.
             joins: Whether it takes part in lockstep; None: yes if the bench runs in lockstep.
+            may_end: Whether it may end before the run.
 
         Raises:
             BenchError: If it ends, or does not join in time.
@@ -88,8 +115,9 @@ class Trial:
         assert self.bench is not None
         bench, before = self.bench, self.bench.links
         device = Device(
-            command, name=name, bench=bench, log=self.folder / f"{name}.log", where=where, files=self.folder
-        )
+            command, name=name, bench=bench, log=self.records / f"{name}.log", where=where, files=self.folder,
+            may_end=may_end,
+        )  # fmt: skip
         self.devices.append(device)
         device.joins = bench.pace == "lockstep" if joins is None else joins
         if device.joins:
@@ -103,7 +131,8 @@ class Trial:
         from replays.campaigns.equipment.record import Record
 
         assert self.bench is not None
-        self.record = Record(self.bench, self.folder / "session.mcap")
+        self.record = Record(self.bench, self.records / "session.mcap")
+        self.record.wait_until_connected()  # otherwise its connection would count as that of a device
         return self.record
 
     @property
@@ -129,7 +158,7 @@ class Trial:
 
     def mask_addresses(self, text: str) -> str:
         """Replace the folders, ports and names of this run in a text, so that every run gives the same text."""
-        masked = text.replace(str(self.folder), "{folder}")
+        masked = text.replace(str(self.folder), "{folder}").replace(str(self.records), "{records}")
         bench = self.bench
         urls = () if bench is None else (bench.can_url, bench.url)
         addresses = () if bench is None else (bench.socketcand_url, bench.slcan_path, bench.name)
@@ -141,36 +170,59 @@ class Trial:
         """End all processes; keep the evidence of a failure, and remove the rest."""
         with ExitStack() as stack:
             stack.callback(self._clean_up, failed)
-            if self.record is not None and self.recording is None:
-                with contextlib.suppress(RuntimeError, InputError):
-                    self.recording = self.record.stop()
             for device in self.devices:
-                stack.callback(device.program.end)
+                stack.callback(device.end)
             if self.bench is not None:
                 stack.callback(self.bench.close)
+            if self.record is not None and self.recording is None:
+                with contextlib.suppress(RuntimeError, InputError, ConnectionError):
+                    self.recording = self.record.stop()
 
     def _clean_up(self, failed: bool) -> None:
         if failed:
             self._keep_evidence()
-        if not failed or self.evidence is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
+        for folder in (self.folder, *([self.records] if not failed or self.evidence is not None else ())):
+            shutil.rmtree(folder, ignore_errors=True)
 
     def _keep_evidence(self) -> None:
         if self.settings is None:
             return
-        folder = self.folder if self.evidence is None else self.evidence / folder_name(self.id)
+        folder = self.records if self.evidence is None else self.evidence / folder_name(self.id)
         folder.mkdir(parents=True, exist_ok=True)
         # Logs and files of devices; an excerpt replaces the recorded session.
-        for file in sorted(self.folder.iterdir()):
-            if file.is_file() and file.suffix != ".mcap" and file.stat().st_size < _MAX_EVIDENCE_BYTES:
-                if folder != self.folder:
-                    shutil.copyfile(file, folder / file.name)
-                self.kept.append(folder / file.name)
+        for log in sorted(self.records.glob("*.log")):
+            if folder != self.records:
+                shutil.copyfile(log, folder / log.name, follow_symlinks=False)
+            self.kept.append(folder / log.name)
+        self._keep_files(folder / "files")
         try:
             if self.recording is not None:
                 self.kept += self._cut(self.recording, folder)
         except (InputError, DiskError, RuntimeError) as error:
             self.troubles.append(f"no evidence of the recording: {error}")
+
+    def _keep_files(self, folder: Path) -> None:
+        """Copy the devices' files up to a total size, and report what is not copied."""
+        left_out, total = [], 0
+        for number, file in enumerate(self.find_files()):
+            entry = file.lstat()
+            name = folder_name(str(file.relative_to(self.folder)))
+            if not stat.S_ISREG(entry.st_mode) or total + entry.st_size > MAX_KEPT_BYTES or number >= MAX_FILES:
+                left_out.append(name)
+                continue
+            folder.mkdir(exist_ok=True)
+            copy = folder / (f"{number}-{name}" if (folder / name).exists() else name)
+            try:
+                shutil.copyfile(file, copy, follow_symlinks=False)
+            except OSError as error:
+                left_out.append(f"{name} ({error.strerror})")
+                continue
+            total += entry.st_size
+            self.kept.append(copy)
+        if left_out:
+            what = f"more than {MAX_KEPT_BYTES / 1e6:g} MB in total, more than {MAX_FILES} files, or no plain file"
+            names = ", ".join(left_out[:5]) + (", ..." if left_out[5:] else "")
+            self.troubles.append(f"files of devices that were not kept ({what}): {len(left_out)}: {names}")
 
     def _cut(self, recording: Recording, folder: Path) -> list[Path]:
         from recorder.reader import Recording

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat
 
-from replays.campaigns.equipment.bench import BenchSettings, Pace
+from replays.campaigns.equipment.bench import BenchSettings, Pace, Waits
 from rig.base.checks import Written, check
 from rig.run.commands.table import TimedCommand
 from rig.run.scenes import load_scene
@@ -24,6 +24,7 @@ class _Marker(Written):
     duration_s: Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)] | None = None
     table: Path | None = None
     can: bool = False
+    wait: Waits = Waits()
 
 
 def read_settings(arguments: dict[str, Any]) -> BenchSettings:
@@ -43,5 +44,14 @@ def read_settings(arguments: dict[str, Any]) -> BenchSettings:
         load_scene(args.scene, dict(args.set))
     scene = None if args.scene is None else str(args.scene)
     return BenchSettings(
-        scene, args.pace, args.block_ms, args.set, args.channels, timed, args.duration_s, args.table, args.can
+        scene,
+        args.pace,
+        args.block_ms,
+        args.set,
+        args.channels,
+        timed,
+        args.duration_s,
+        args.table,
+        args.can,
+        args.wait,
     )

@@ -25,7 +25,7 @@ _TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
 _FAILED = pytest.StashKey[bool]()
 _MARKER = (
     'bench(scene="stable-run", pace="lockstep", block_ms=10, set={}, channels=[], faults=[], commands=[], '
-    "duration_s=None, can=False): the rig that a test is run on"
+    "duration_s=None, can=False, wait={}): the rig that a test is run on"
 )
 
 
@@ -135,8 +135,23 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
     """Raise the outcome of a trial's measurements after its test has ended without an error of its own."""
     result = yield
     if (trial := item.stash.get(_TRIAL, None)) is not None:
+        if trial.devices and not isinstance(item, CampaignItem):
+            _judge_devices(item, trial)
         trial.raise_outcome()
     return result
+
+
+def _judge_devices(item: pytest.Item, trial: Trial) -> None:
+    """End the run of a test in Python and judge its devices, as for a campaign file."""
+    from replays.campaigns.files.run import finish_run, note_early_ends
+
+    measured = len(trial.measurements)
+    note_early_ends(trial)
+    try:
+        finish_run(trial)
+    finally:
+        for measurement in trial.measurements[measured:]:
+            item.user_properties.extend(measurement.properties())
 
 
 @pytest.hookimpl(wrapper=True)
@@ -198,11 +213,17 @@ def bench(request: pytest.FixtureRequest, rig_trial: Trial) -> Bench:
 
 
 @pytest.fixture
-def dut(bench: Bench, rig_trial: Trial, request: pytest.FixtureRequest) -> Callable[..., Device]:
-    """Start a device under test: `dut("python protection.py {url} --name {name}", name="protection")`."""
+def dut(record: Record, rig_trial: Trial, request: pytest.FixtureRequest) -> Callable[..., Device]:
+    """Start a device under test: `dut("python protection.py {url} --name {name}", name="protection")`.
 
-    def start(command: str | Sequence[str], *, name: str = "device", joins: bool | None = None) -> Device:
-        return rig_trial.start_device(command, name=name, where=request.node.path.parent, joins=joins)
+    The test fails if the device is lost, ends with a status other than 0, or ends before the test without `may_end`.
+    """
+
+    def start(
+        command: str | Sequence[str], *, name: str = "device", joins: bool | None = None, may_end: bool = False
+    ) -> Device:
+        where = request.node.path.parent
+        return rig_trial.start_device(command, name=name, where=where, joins=joins, may_end=may_end)
 
     return start
 
@@ -210,9 +231,7 @@ def dut(bench: Bench, rig_trial: Trial, request: pytest.FixtureRequest) -> Calla
 @pytest.fixture
 def record(bench: Bench, rig_trial: Trial) -> Record:
     """Record the bench from the start of the test; `record.stop()` returns the recording."""
-    started = rig_trial.start_record()
-    started.wait_until_connected()  # otherwise its connection would count as that of a device
-    return started
+    return rig_trial.start_record()
 
 
 @pytest.fixture

@@ -42,19 +42,19 @@ Start = Callable[..., Device]
 Measure = Callable[..., float]
 
 
-def start(dut: Start, record: Record, command: str | Sequence[str]) -> Device:
+def start(dut: Start, command: str | Sequence[str]) -> Device:
     """Start the recorder under test and return it once it records."""
     recorder = dut(command, name="recorder", joins=False)
     for _ in Deadline(_END_S).polls():
-        if (record.path.parent / OUTPUT_FILE).exists():
+        if (recorder.folder / OUTPUT_FILE).exists():
             return recorder
         recorder.check_running()
     raise AssertionError(f"the recorder did not create {OUTPUT_FILE}")
 
 
-def lost_s(record: Record, measure: Measure, until_s: float) -> float:
+def lost_s(recorder: Device, record: Record, measure: Measure, until_s: float) -> float:
     """Return the length missing at the end of the data sent before a time [s]; compare the rest with the data sent."""
-    sent, folder = record.stop(), record.path.parent
+    sent, folder = record.stop(), recorder.folder
     if RECOVER_COMMAND:
         program = Program([word.format(folder=folder) for word in shlex.split(RECOVER_COMMAND)], folder / "recover.log")
         status = program.wait(_END_S)
@@ -76,12 +76,12 @@ def test_a_kill_takes_nothing_that_was_sent_long_enough_before(
     bench: Bench, dut: Start, record: Record, measure: Measure
 ) -> None:
     """Test in lockstep: the rig waits while the recorder writes, so the comparison is exact."""
-    recorder = start(dut, record, RECORD_COMMAND)
+    recorder = start(dut, RECORD_COMMAND)
     bench.advance_to(1.0)
     time.sleep(WRITE_S)
     recorder.program.kill()
     bench.advance_to(1.5)
-    lost = lost_s(record, measure, 1.0)
+    lost = lost_s(recorder, record, measure, 1.0)
     measure("lost although two seconds were left to write it", lost, "s", "==", 0.0)
 
 
@@ -90,13 +90,13 @@ def test_a_kill_in_the_middle_takes_the_last_rows_alone(
     bench: Bench, dut: Start, record: Record, measure: Measure
 ) -> None:
     """Test in real time: samples arrive until the recorder is killed."""
-    recorder = start(dut, record, RECORD_COMMAND)
+    recorder = start(dut, RECORD_COMMAND)
     begun_s = bench.status()["time_s"]
     bench.advance_to(begun_s + 3.3)
     recorder.program.kill()
     killed_s = bench.status()["time_s"]
     bench.advance_to(killed_s + 0.2)
-    lost = lost_s(record, measure, killed_s)
+    lost = lost_s(recorder, record, measure, killed_s)
     measure("lost before the kill", lost, "s", "<=", WRITE_S, source="assumed; `rig record` guarantees 0.5 s")
 
 
@@ -106,12 +106,13 @@ def test_a_full_disk_ends_it_with_a_reason_and_what_is_there_reads(
 ) -> None:
     """Simulate a full disk by a limit on file sizes; its signal is ignored, since a disk sends none."""
     limit = f"trap '' XFSZ; ulimit -f {DISK_BYTES // 512}; exec \"$@\""
-    recorder = start(dut, record, ["sh", "-c", limit, "sh", *shlex.split(RECORD_COMMAND)])
+    recorder = start(dut, ["sh", "-c", limit, "sh", *shlex.split(RECORD_COMMAND)])
     bench.advance_to(3.0)
     status = recorder.program.wait(_END_S)
+    recorder.program.end()  # its exit status is judged here
     assert status is not None, "the recorder continues although the disk is full"
     measure("exit status", status, "1", "between", (1, 127), source="0 would mean a complete recording")
     lines = recorder.program.read_output().splitlines()
     measure("tracebacks", sum("Traceback" in line for line in lines), "1", "==", 0)
     measure("lines that report the reason", sum(any(word in line for word in REASONS) for line in lines), "1", ">=", 1)
-    assert lost_s(record, measure, 3.0) > 0.0, "the disk was not full"
+    assert lost_s(recorder, record, measure, 3.0) > 0.0, "the disk was not full"

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.campaigns.equipment.bench import Target, validate_replay
+from replays.campaigns.equipment.bench import BenchSettings, Target, validate_replay
 from replays.campaigns.evidence import Trial
 from replays.campaigns.files.campaign import find_shipped, load_campaign
 from replays.campaigns.files.case_results import CaseRecording
@@ -190,11 +190,18 @@ def test_a_run_stopped_early_fails_unless_expected(tmp_path: Path) -> None:
 
 
 def test_only_a_device_that_must_be_killed_fails(tmp_path: Path) -> None:
-    for status, notes in ((137, ["it had to be killed: it did not end within 5 s of a SIGTERM"]), (143, []), (0, [])):
-        program = SimpleNamespace(status=None, last_line="", end=lambda: None)
-        program.end = lambda program=program, status=status: setattr(program, "status", status)
-        trial = Trial("a", folder=tmp_path, target=Target(url="zenoh:elsewhere"))
-        end_device(cast("Any", SimpleNamespace(name="guard", program=program)), trial)
+    for status, notes in (
+        (137, ["it had to be killed: it did not end within end_s = 5 s of a SIGTERM"]),
+        (143, []),
+        (0, []),
+    ):
+        program = SimpleNamespace(status=None, last_line="", is_output_cut=False)
+        device = SimpleNamespace(
+            name="guard", program=program, is_ended_by_test=False, bench=SimpleNamespace(settings=BenchSettings()),
+            end=lambda program=program, status=status: setattr(program, "status", status),
+        )  # fmt: skip
+        trial = Trial("a", folder=tmp_path, records=tmp_path, target=Target(url="zenoh:elsewhere"))
+        end_device(cast("Any", device), trial)
         assert [each.note for each in trial.measurements if not each.good] == notes
 
 
@@ -247,7 +254,8 @@ def results(**margins: float) -> dict[str, Any]:
         "format": 1, "titles": ["T"],
         "counts": {"failed": 1, "error": 1, "interrupted": 0, "inconclusive": 0, "skipped": 1, "passed": 1},
         "cases": cases,
-        "wall": {"begun": "2026-01-01T08:00:00", "duration_s": 2.5, "machine": "M", "rig": "0", "cases": wall},
+        "wall": {"begun": "2026-01-01T08:00:00", "duration_s": 2.5, "machine": "M", "rig": "0",
+                 "containment": "subreaper", "cases": wall},
     }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
@@ -337,6 +338,32 @@ def test_a_removed_folder_leaves_a_copy_in_the_nearest_one(tmp_path, items):
     payloads = [payload for _, payload in Recording.open(copy).payloads(PROBES)]
     assert payloads == [payload for key, payload in items if key == PROBES][: len(payloads)]
     assert len(payloads) >= 24
+
+
+@pytest.mark.parametrize("how", ["copy", "link", "append"])
+def test_a_replaced_file_is_an_error_and_is_not_published(how, tmp_path, items):
+    file = series(tmp_path / "run.mcap")
+    for key, payload in items[:200]:
+        file.take(Payload.read(key, payload, 0))
+    if how == "append":
+        os.truncate(file.part, 10_000_000)
+    else:
+        other = tmp_path / "other"
+        other.write_bytes(b"old")
+        file.part.rename(tmp_path / "away")
+        file.part.hardlink_to(other) if how == "copy" else file.part.symlink_to(other)
+    with pytest.raises(RecordingError, match=r"was replaced .* are kept in .*run\.saved\.mcap"):
+        file.finish("completed")
+    assert not (tmp_path / "run.mcap").exists()
+    if how != "append":
+        saved = [payload for _, payload in Recording.open(tmp_path / "run.saved.mcap.part").payloads(PROBES)]
+        assert saved == [payload for key, payload in items[:200] if key == PROBES]
+
+
+def test_the_digest_is_that_of_the_file(tmp_path, items):
+    file = series(tmp_path / "run.mcap")
+    write(file, items)
+    assert file.sha256 == hashlib.sha256((tmp_path / "run.mcap").read_bytes()).hexdigest()
 
 
 def test_a_recovered_part_and_cuts_of_parts_join(parts, tmp_path):

@@ -13,10 +13,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from pydantic import Field, FiniteFloat
+
+from replays.campaigns.equipment.cleanup import END_S
 from replays.campaigns.equipment.process import Program
 from rig.base import wire
+from rig.base.checks import Written
 from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.outcome import InconclusiveError
@@ -29,14 +33,26 @@ if TYPE_CHECKING:
     from drivers.console import AcceptedStep
     from rig.run.commands.table import TimedCommand
 
-START_S = 300.0
-"""Longest start of a rig, including a first compilation of the kernels [s]."""
-JOIN_S = 30.0
-"""Longest time for a device to join a rig in lockstep [s]."""
 _LIVE_S = 86_400.0
 """Nominal length of a run in real time; the test ends it earlier [s]."""
 _ROUND_TRIPS = 20
 Pace = Literal["lockstep", "real-time"]
+
+
+_Wait = Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)]
+
+
+class Waits(Written):
+    """Limits of wall-clock time [s]."""
+
+    start_s: _Wait = 300.0
+    """Start of a rig, including a first compilation of the kernels."""
+    join_s: _Wait = 30.0
+    """Time for a device to join a rig in lockstep."""
+    patience_s: _Wait = 600.0
+    """Duration of a step of the rig by up to 1 s, during which it may wait for slow devices."""
+    end_s: _Wait = END_S
+    """Time for a device to end after the run, and again after a SIGTERM."""
 
 
 class BenchError(RuntimeError):
@@ -83,6 +99,7 @@ class BenchSettings:
         duration_s: Length of the run [s]; None: as in the scene, or unlimited in real time.
         table: The user's own channel table.
         can: Whether the rig is also a node on a CAN bus.
+        wait: Limits of wall-clock time.
     """
 
     scene: str | None = None
@@ -94,6 +111,7 @@ class BenchSettings:
     duration_s: float | None = None
     table: Path | None = None
     can: bool = False
+    wait: Waits = field(default_factory=Waits)
 
     def document(self) -> dict[str, Any]:
         """Return the settings as a JSON document."""
@@ -101,6 +119,7 @@ class BenchSettings:
         return {
             "scene": self.scene, "pace": self.pace, "block_ms": self.block_ms, "set": dict(self.set),
             "commands": commands, "duration_s": self.duration_s, "can": self.can,
+            "wait": self.wait.model_dump(),
         }  # fmt: skip
 
 
@@ -145,13 +164,14 @@ class Bench(Closing):
             self.url = target.url
         else:
             self._program = Program(self._command(), folder / "rig.log")
-            line = self._program.wait_for("listening on", START_S)
+            line = self._program.wait_for("listening on", settings.wait.start_s)
             if line is None:
                 last_line = self._program.last_line
+                within = f" within start_s = {settings.wait.start_s:g} s" if self._program.status is None else ""
                 self._program.end()
-                raise BenchError(f"the rig did not start: {last_line}")
+                raise BenchError(f"the rig did not start{within}: {last_line}")
             self.url = f"zenoh:{line.partition('listening on ')[2].split()[0].rstrip(';')}"
-            if settings.can and (line := self._program.wait_for(_SLCAN, START_S)) is not None:
+            if settings.can and (line := self._program.wait_for(_SLCAN, settings.wait.start_s)) is not None:
                 self.slcan_path = line.partition(_SLCAN)[2]
         try:
             self._console = self.connect(name="campaign", channels=())
@@ -233,7 +253,29 @@ class Bench(Closing):
         """Names, as the rig knows them, of the devices that take part in lockstep."""
         return [row["name"] for row in self.status().get("devices", []) if row["state"] == "joined"]
 
-    def wait_for(self, device: str, *, timeout_s: float = JOIN_S) -> None:
+    @property
+    def lost(self) -> dict[str, str]:
+        """Devices that the rig lists as lost, with the reasons; empty if it does not respond."""
+        with contextlib.suppress(RefusedError, ConnectionError):
+            return {row["name"]: row["reason"] for row in self.status().get("devices", []) if row["state"] == "lost"}
+        return {}
+
+    def stop(self) -> None:
+        """End the run of the bench's own rig.
+
+        Raises:
+            BenchError: If the rig had ended with an error, or another process took its place.
+        """
+        if not self.target.owns_rig:
+            return
+        self.late_blocks()  # while the rig still responds
+        assert self._program is not None
+        if (status := self._program.status) not in (None, 0):
+            raise BenchError(f"the rig exited with status {status}: {self._program.last_line}")
+        with contextlib.suppress(RefusedError, ConnectionError):  # the run has ended
+            self._console.stop()
+
+    def wait_for(self, device: str, *, timeout_s: float | None = None) -> None:
         """Wait until a device under test takes part in lockstep, even if another program started it.
 
         Raises:
@@ -242,7 +284,7 @@ class Bench(Closing):
         self.wait_for_joined(lambda name: name == device, device, timeout_s=timeout_s)
 
     def wait_for_joined(
-        self, fits: Callable[[str], bool], device: str, *, timeout_s: float = JOIN_S,
+        self, fits: Callable[[str], bool], device: str, *, timeout_s: float | None = None,
         look: Callable[[], object] = lambda: None,
     ) -> str:  # fmt: skip
         """Wait until a matching device takes part in lockstep, and return the rig's name for it.
@@ -250,20 +292,22 @@ class Bench(Closing):
         Args:
             fits: Predicate on the name of a device.
             device: Name of the device in error messages.
-            timeout_s: Longest wait [s].
+            timeout_s: Longest wait [s]; None: `join_s` of the settings.
             look: Function called while waiting, for example to check that the device still runs.
 
         Raises:
             BenchError: If no such device joins in time.
         """
         now: list[str] = []
-        for _ in Deadline(timeout_s).polls():
+        within_s = self.settings.wait.join_s if timeout_s is None else timeout_s
+        for _ in Deadline(within_s).polls():
             now = self.joined
             if device_name := next(filter(fits, now), None):
                 return device_name
             look()
         others = ", ".join(now) or "none"
-        raise BenchError(f"device {device} did not join within {timeout_s:g} s; joined devices: {others}")
+        limit = f"{'join_s = ' if timeout_s is None else ''}{within_s:g} s"
+        raise BenchError(f"device {device} did not join within {limit}; joined devices: {others}")
 
     def advance_to(self, time_s: float) -> None:
         """Advance the rig to a time [s] or to its end: step it by whole blocks in lockstep, or wait in real time.
@@ -301,11 +345,12 @@ class Bench(Closing):
             RefusedError: If the rig refuses to step.
         """
         try:
-            return self._console.step(ticks, timeout_s=_STEP_S)
+            return self._console.step(ticks, timeout_s=self.settings.wait.patience_s)
         except ConnectionError as error:
             if self._program is not None and (status := self._program.wait(_EXIT_S)) is not None:
                 raise BenchError(f"the rig exited with status {status}: {self._program.last_line}") from None
-            raise BenchError(f"the rig does not advance: {error}") from None
+            limit = f"patience_s = {self.settings.wait.patience_s:g} s"
+            raise BenchError(f"the rig did not complete a step within {limit}: {error}") from None
 
     def floor_ms(self) -> tuple[float, float]:
         """Return the median and maximum round-trip time of a request [ms], the lower limit of any command latency."""
@@ -382,8 +427,6 @@ _NUMBERS = itertools.count(1)
 _MAX_MISSING_S = 0.01
 """Longest part of a run that a recording may lack, as it ends at its last sample [s]."""
 _TICKS_PER_STEP = 1_000_000
-_STEP_S = 600.0
-"""Longest duration of a step, during which the rig may wait for slow devices [s]."""
 _EXIT_S = 2.0
 """Longest time between the loss of the connection and the exit of the rig's process [s]."""
 

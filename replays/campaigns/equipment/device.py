@@ -34,6 +34,7 @@ class Device:
             `{socketcand}` (HOST:PORT of its socketcand server), `{slcan}` (path of its SLCAN adapter), `{name}` (name
             of the device) and `{folder}` (folder for its files).
         name: Name of the device.
+        may_end: Whether it may end before the run.
         bench: Bench that it is tested on.
         log: File for its output.
         where: Working directory.
@@ -44,20 +45,32 @@ class Device:
     """
 
     def __init__(
-        self, command: str | Sequence[str], *, name: str, bench: Bench, log: Path, where: Path, files: Path
-    ) -> None:
+        self, command: str | Sequence[str], *, name: str, bench: Bench, log: Path, where: Path, files: Path,
+        may_end: bool = False,
+    ) -> None:  # fmt: skip
         given = (bench.url, bench.can_url, bench.socketcand_url, bench.slcan_path, name, str(files))
         places = {place: text for place, text in zip(PLACES, given, strict=True) if text is not None}
         words = shlex.split(command) if isinstance(command, str) else list(map(str, command))
         words = [fill_placeholders(word, places, "command") for word in words]
         check_program(words, where, field="command")
-        self.name, self.log, self._bench = name, log, bench
+        self.name, self.log, self.folder, self.may_end, self.bench = name, log, files, may_end, bench
         self.joins = True
         """Whether the rig waits for it in lockstep."""
+        self.is_ended_by_test = self.was_lost = self.has_ended_early = False
+        """True if the test ended it, if it was lost before that, and if it ended before the run by itself."""
         self.rig_name = name
         """The rig's name for the device; a number on CAN."""
         self._others = bench.joined
-        self.program = Program(words, log, folder=where)
+        self.program = Program(words, log, folder=where, end_s=bench.settings.wait.end_s)
+        self.program.before_end = self._note_loss
+
+    def _note_loss(self) -> None:
+        self.was_lost = self.rig_name in self.bench.lost
+
+    def end(self) -> None:
+        """End the program after the test, unless the test has ended it."""
+        self.is_ended_by_test, self.program.is_ended = self.program.is_ended, True
+        self.program.end()
 
     def wait_until_joined(self) -> None:
         """Wait until the device takes part in lockstep.
@@ -65,7 +78,7 @@ class Device:
         Raises:
             BenchError: If it ends, or does not join in time.
         """
-        self.rig_name = self._bench.wait_for_joined(
+        self.rig_name = self.bench.wait_for_joined(
             lambda name: name not in self._others, self.name, look=self.check_running
         )
 
@@ -79,7 +92,7 @@ class Device:
             BenchError: If the device has ended.
         """
         for _ in Deadline(_LINK_S).polls():
-            if self._bench.links > before:
+            if self.bench.links > before:
                 return
             self.check_running()
 

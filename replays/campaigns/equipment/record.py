@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import sys
 import threading
-from pathlib import Path
+import weakref
+from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING
 
 from replays.campaigns.equipment.bench import BenchError
+from rig.base.errors import PART_SUFFIX
+from rig.base.outcome import InconclusiveError
 from rig.serve.waiting import Deadline, wait_until
 
 if TYPE_CHECKING:
@@ -19,12 +25,25 @@ _BEGIN_S, _END_S = 30.0, 60.0
 """Longest start and longest end of a recording [s]."""
 
 
+class ReplacedRecordingError(BenchError, InconclusiveError):
+    """Error of a recording that is not the one that was written, and cannot be judged."""
+
+
+class _OpenPath(PosixPath):
+    """Path of a file that is opened through a descriptor, so that a file put in its place is not read."""
+
+    opened = ""
+
+    def __fspath__(self) -> str:
+        return self.opened or str(self)
+
+
 class Record:
     """Records a bench: from the start of the run if the test started the rig, otherwise from now on.
 
     Args:
         bench: The bench.
-        path: Output file, ending in .mcap.
+        path: Output file, ending in .mcap, in a folder that no device under test is told.
     """
 
     def __init__(self, bench: Bench, path: Path) -> None:
@@ -63,6 +82,9 @@ class Record:
         """
         for _ in Deadline(_BEGIN_S).polls():
             if "campaign" in self._bench.status()["clients"]:
+                # No device has been started yet.
+                self._descriptor = os.open(self.path.with_name(self.path.name + PART_SUFFIX), os.O_RDONLY)
+                weakref.finalize(self, os.close, self._descriptor)
                 return
             if not self._thread.is_alive():
                 break
@@ -73,6 +95,7 @@ class Record:
 
         Raises:
             BenchError: If samples are missing that no fault removed, or the disk failed.
+            ReplacedRecordingError: If the file was removed, replaced or altered.
         """
         from recorder.reader import Recording
 
@@ -83,9 +106,37 @@ class Record:
         summary = self._summary
         if summary is None:
             raise BenchError(f"the recording failed: {self._error or 'it did not end'}")
+        self._check_file(summary)
         if summary.error or summary.losses:
             raise BenchError(f"the recording lacks {'; '.join(summary.losses) or summary.error}")
-        return Recording.open(self.path)
+        path = _OpenPath(self.path)
+        if sys.platform == "linux":
+            path.opened = f"/proc/self/fd/{self._descriptor}"
+        return Recording.open(path)
+
+    def _check_file(self, summary: Summary) -> None:
+        """Compare the file with the one that was opened before any device started.
+
+        Raises:
+            ReplacedRecordingError: If inode, size or digest differ.
+        """
+        opened = os.fstat(self._descriptor)
+        wrong = ""
+        try:
+            named = summary.path.lstat()
+            if not os.path.samestat(named, opened):
+                wrong = "another file has its name"
+        except OSError:
+            wrong = "it was removed"
+        if not wrong and not summary.error:
+            digest, position = hashlib.sha256(), 0
+            while data := os.pread(self._descriptor, 1 << 20, position):
+                digest.update(data)
+                position += len(data)
+            if position != summary.size_bytes or digest.hexdigest() != summary.sha256:
+                wrong = f"its {position} bytes are not the {summary.size_bytes} bytes that were written"
+        if wrong:
+            raise ReplacedRecordingError(f"the recording was replaced or altered during the test: {wrong}")
 
     def wait(self) -> None:
         """Wait until the recording has ended with the rig's run."""

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat
 
-from replays.campaigns.equipment.bench import BenchSettings, Pace
+from replays.campaigns.equipment.bench import BenchSettings, Pace, Waits
 from replays.campaigns.equipment.device import CAN_PLACES, PLACEHOLDER, PLACES, check_program, fill_placeholders
 from replays.campaigns.files.case_results import Time, Units
 from replays.campaigns.files.expectation import KINDS, Expect, find_events
@@ -61,6 +61,8 @@ class _Device(Written):
     """True if it sends commands, which a recording does not accept."""
     folder: str = ""
     """Working folder, relative to that of the campaign file."""
+    may_end: bool = False
+    """True if it may end, or leave lockstep, before the end of the case."""
 
 
 class _Matrix(Written):
@@ -81,6 +83,7 @@ class _File(Written):
     set: dict[str, Any] = Field(default={})
     channels: str = ""
     can: bool = False
+    wait: Waits = Waits()
     device: _Device | None = None
     devices: list[_Device] = Field(default=[])
     limits: dict[str, Quantity] = Field(default={})
@@ -320,7 +323,13 @@ def _case(
     if not expects:
         raise InputError("expect", "with something for each case", Words(f"nothing for {name}"))
     bench = BenchSettings(
-        scene=scene_name, pace=file.pace, block_ms=file.block_ms, set=changes, table=table, can=file.can
+        scene=scene_name,
+        pace=file.pace,
+        block_ms=file.block_ms,
+        set=changes,
+        table=table,
+        can=file.can,
+        wait=file.wait,
     )
     ordered = tuple(sorted(steps, key=lambda step: step.at_s))
     return Case(name, file.title, path, bench, duration_s, ordered, devices, tuple(expects), axis_labels)

@@ -13,6 +13,7 @@ from pydantic import Field, FiniteFloat
 from replays.campaigns.measurement import Must
 from rig.base import units as units_of
 from rig.base.checks import Written
+from rig.base.errors import InputError
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
@@ -91,10 +92,23 @@ class CaseRecording:
 
         key = file, limits, path, channels
         if key not in self._cards:
+            check_no_symlinks(self.folder, file)
             sent = [part.path for part in self.recording.parts]
             loaded = load_limits(limits)
             self._cards[key] = judge(self.folder / file, sent, limits=loaded, path=path, channels=channels)
         return self._cards[key]
+
+
+def check_no_symlinks(folder: Path, file: str) -> None:
+    """Refuse a device's file outside its folder, or behind a symbolic link, which could lead to any file.
+
+    Raises:
+        InputError: If the path leaves the folder or contains a symbolic link.
+    """
+    path = folder / file
+    inside = [each for each in (path, *path.parents) if folder in each.parents]
+    if not inside or ".." in Path(file).parts or any(each.is_symlink() for each in inside):
+        raise InputError("file", "a file in {folder}, without symbolic links", file)
 
 
 def parse_limit(text: str, unit: str, *, where: str, of: str) -> Must:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from replays.campaigns.equipment.bench import UnsupportedError
-from replays.campaigns.equipment.cleanup import KILLED, PATIENCE_S
+from replays.campaigns.equipment.cleanup import KILLED
+from replays.campaigns.evidence import MAX_FILES
 from replays.campaigns.files.case_results import CaseRecording
-from replays.campaigns.files.expectation import EventOf, expected_events
+from replays.campaigns.files.expectation import expected_events
 from replays.campaigns.measurement import Measurement, Must
 from rig.base import wire
 from rig.base.errors import RefusedError
@@ -20,9 +22,6 @@ if TYPE_CHECKING:
     from replays.campaigns.equipment.device import Device
     from replays.campaigns.evidence import Trial
     from replays.campaigns.files.campaign import Case, Step
-
-_LAST_S = 5.0
-"""Longest time for a device to end after the run [s]."""
 
 
 def run_case(case: Case, trial: Trial) -> None:
@@ -51,26 +50,21 @@ def run_case(case: Case, trial: Trial) -> None:
     for each in case.devices if trial.target.replay is not None else ():
         if each.commands:
             raise UnsupportedError(f"a recording takes no commands of {each.name}")
-    record = trial.start_record()
-    record.wait_until_connected()
+    trial.start_record()
     for each in case.devices:
         joins, where = None if each.joins else False, case.file.parent / each.folder
-        trial.start_device(each.command, name=each.name, where=where, joins=joins)
+        trial.start_device(each.command, name=each.name, where=where, joins=joins, may_end=each.may_end)
     trial.origin_s = bench.begin()
     with bench.connect(name="campaign", channels=()) as machine:
         for step in live:
             bench.advance_to(trial.origin_s + step.at_s)
             _send(machine, step)
-        bench.advance_to(trial.origin_s + case.duration_s)
-        if trial.target.owns_rig:
-            bench.late_blocks()  # while the rig still responds
-            _stop(machine)
-            record.wait()
-    trial.recording = record.stop()
-    for device in trial.devices:
-        end_device(device, trial)
-    results = CaseRecording(trial.recording, trial.folder, trial.origin_s)
-    _measure_device(results, trial)
+        end_s = trial.origin_s + case.duration_s
+        # A device that needs the last block has not ended before it.
+        bench.advance_to(end_s - 1e-3 * settings.block_ms)
+        note_early_ends(trial)
+        bench.advance_to(end_s)
+        results = finish_run(trial)
     measure_end(results, trial, case)
     for expect in case.expects:
         for measurement in expect.measure(results, results.units):
@@ -99,24 +93,54 @@ def _send(machine: Rig, step: Step) -> None:
         raise UnsupportedError(f"the rig refuses a step at {step.at_s:g} s: {error}") from None
 
 
-def _stop(machine: Rig) -> None:
-    try:
-        machine.stop()
-    except (RefusedError, ConnectionError):
-        return  # the run has ended
+def finish_run(trial: Trial) -> CaseRecording:
+    """End the run, the devices and the recording, and judge the devices, for campaign files and tests in Python alike.
+
+    Raises:
+        BenchError: If the rig or the recording failed.
+        ReplacedRecordingError: If the recording was removed, replaced or altered.
+    """
+    assert trial.bench is not None
+    assert trial.record is not None
+    lost = trial.bench.lost
+    trial.bench.stop()
+    if trial.target.owns_rig:
+        trial.record.wait()
+    for device in trial.devices:
+        end_device(device, trial)
+    trial.recording = trial.record.stop()  # no device can alter it any more
+    results = CaseRecording(trial.recording, trial.folder, trial.origin_s)
+    for device in trial.devices:
+        _measure_device(device, results, trial, lost)
+    if trial.devices and not trial.has_folder():
+        trial.take(Measurement("times that {folder} was removed or replaced", 1.0, Must("==", 0.0, "1")))
+    if (files := sum(1 for _ in trial.find_files())) > MAX_FILES:
+        trial.take(Measurement("files in {folder}", float(files), Must("<=", float(MAX_FILES), "1"), note="or more"))
+    return results
+
+
+def note_early_ends(trial: Trial) -> None:
+    """Note which devices have ended by now, before the end of the run."""
+    for device in trial.devices:
+        device.has_ended_early = not device.program.is_ended and device.program.status is not None
 
 
 def end_device(device: Device, trial: Trial) -> None:
-    """Wait for a device to end after the run, and judge its exit status."""
-    wait_until(lambda: device.program.status is not None or not trial.target.owns_rig, _LAST_S)
-    status = device.program.status
-    device.program.end()
-    note = f"its last line: {device.program.last_line}" if status else ""
-    if status is None and device.program.status == KILLED:
-        status, note = KILLED, f"it had to be killed: it did not end within {PATIENCE_S:g} s of a SIGTERM"
-    if status is not None:
+    """Wait for a device to end after the run, and judge its exit status and output unless the test has ended it."""
+    program, wait = device.program, device.bench.settings.wait
+    wait_until(lambda: program.status is not None or not trial.target.owns_rig, wait.end_s)
+    status = program.status
+    device.end()
+    note = f"its last line: {program.last_line}" if status else ""
+    if status is None and program.status == KILLED:
+        status, note = KILLED, f"it had to be killed: it did not end within end_s = {wait.end_s:g} s of a SIGTERM"
+    if status is not None and not device.is_ended_by_test:
         must = Must("==", 0.0, "1")
         trial.take(Measurement(f"exit status of {device.name}", float(status), must, note=note))
+    if program.is_output_cut:
+        must = Must("<=", program.max_output_bytes / 1e6, "MB")
+        value = program.output_bytes / 1e6
+        trial.take(Measurement(f"output of {device.name}", value, must, note=program.last_line))
 
 
 def measure_end(results: CaseRecording, trial: Trial, case: Case) -> None:
@@ -131,16 +155,30 @@ def measure_end(results: CaseRecording, trial: Trial, case: Case) -> None:
         trial.take(Measurement("end of the run", at_s, Must(">=", case.duration_s, "s"), note=note, at_s=at_s))
 
 
-def _measure_device(results: CaseRecording, trial: Trial) -> None:
-    """Add a measurement for each device in lockstep: it fails, with the rig's reason, if the device was lost."""
-    for device in trial.devices:
-        lost = EventOf(event="device", where={"device": device.rig_name, "state": "lost"})
-        times_s = lost.times_s(results)
-        if trial.bench is not None and trial.bench.pace == "lockstep":
-            reasons = [
-                str(event.get("reason", "")) for _, event in results.events
-                if (event.get("event"), event.get("device"), event.get("state")) == ("device", device.rig_name, "lost")
-            ]  # fmt: skip
-            at_s = times_s[0] if times_s else None
-            name = f"times that {device.name} was lost"
-            trial.take(Measurement(name, float(len(times_s)), Must("==", 0.0, "1"), note="; ".join(reasons), at_s=at_s))
+def _measure_device(device: Device, results: CaseRecording, trial: Trial, lost: Mapping[str, str]) -> None:
+    """Judge whether a device was lost in lockstep, with the rig's reasons, and whether it ended or left early.
+
+    Args:
+        device: The device.
+        results: The recording.
+        trial: The running test.
+        lost: Devices that the rig listed as lost at the end of the test, which the recording may not cover.
+    """
+    states = [
+        (at_s, str(event.get("state")), str(event.get("reason", ""))) for at_s, event in results.events
+        if event["event"] == "device" and event.get("device") == device.rig_name
+    ]  # fmt: skip
+    ends_s = [at_s for at_s, event in results.events if event["event"] == "end"]
+    losses = [(at_s, reason) for at_s, state, reason in states if state == "lost"]
+    if not losses and device.rig_name in lost:
+        losses = [(None, lost[device.rig_name])]
+    if trial.bench is not None and trial.bench.pace == "lockstep" and (device.was_lost or not device.is_ended_by_test):
+        at_s = losses[0][0] if losses else None
+        note = "; ".join(reason for _, reason in losses)
+        name = f"times that {device.name} was lost"
+        trial.take(Measurement(name, float(len(losses)), Must("==", 0.0, "1"), note=note, at_s=at_s))
+    left_s = [at_s for at_s, state, _ in states if state == "left" and ends_s and at_s < ends_s[0]]
+    if (left_s or device.has_ended_early) and not (device.may_end or device.is_ended_by_test):
+        note = f"it {'left lockstep' if left_s else 'ended'} before the run; may_end = true allows it"
+        name, at_s = f"early ends of {device.name}", left_s[0] if left_s else None
+        trial.take(Measurement(name, 1.0, Must("==", 0.0, "1"), note=note, at_s=at_s))

@@ -17,6 +17,9 @@ _MARKS: dict[str, Mark] = {
 _UNCHANGED_MARGIN = 1e-9
 """Relative change of a margin below which it counts as unchanged."""
 
+_MAX_LISTED = 20
+"""Number of evidence files that the page lists for a case."""
+
 
 def make_page(results: Document, folder: Path, earlier: Document | None = None) -> Report:
     """Return the page of a campaign's results.
@@ -36,6 +39,7 @@ def make_page(results: Document, folder: Path, earlier: Document | None = None) 
         "begun": f"{wall['begun']} UTC, {wall['duration_s']:.1f} s",
         "machine": wall["machine"],
         "rig": wall["rig"],
+        "processes found by": wall["containment"],
     }
     report = Report("; ".join(results["titles"]) or "Campaign", f"{summary}.", origin=origin, mark=mark)
     for case in [*bad, *unsure]:
@@ -75,12 +79,13 @@ def _failure(report: Report, case: Document, folder: Path) -> None:
         report.text(f"{each['name']} must be {limit}; {verdict}{note}.{source}")
     for file in case["evidence"]:
         path = folder / file
-        if path.suffix == ".png" and path.is_file():
+        if path.match("evidence/*/event.png") and path.is_file():  # a device's pictures are not shown
             caption = "Signals and events around the failure."
             report.parts.append(Picture(path.read_bytes(), caption))
     for trouble in case["troubles"]:
         report.text(trouble)
-    files = ", ".join(f"`{file}`" for file in case["evidence"])
+    files = ", ".join(f"`{file}`" for file in case["evidence"][:_MAX_LISTED])
+    files += f", and {more} more" if (more := len(case["evidence"]) - _MAX_LISTED) > 0 else ""
     report.text(f"Repeat with: `{case['repeat']}`" + (f". Evidence: {files}" if files else ""))
 
 

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from replays.campaigns.equipment.cleanup import find_containment
 from replays.report import junit, write_report
 from replays.studies.common import provenance
 from rig.base.checks import build_read_error, open_file, read_json
@@ -131,7 +132,7 @@ class Results:
                 "begun": datetime.fromtimestamp(self._begun_s, UTC).strftime("%Y-%m-%dT%H:%M:%S"),
                 "duration_s": round(time.time() - self._begun_s, 3), "machine": provenance.machine(),
                 "rig": " ".join(filter(None, (*provenance.versions(provenance.RIG).values(), provenance.commit()))),
-                "cases": wall,
+                "containment": find_containment(), "cases": wall,
             },
         })  # fmt: skip
 

@@ -1,0 +1,76 @@
+"""Programs of a campaign: their output is bounded, and all of their processes end, also those that hide."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from replays.campaigns.equipment.cleanup import find_containment
+from replays.campaigns.equipment.process import Program
+from replays.campaigns.files.case_results import check_no_symlinks
+from rig.base.errors import InputError
+
+pytestmark = [pytest.mark.wallclock]
+CHILD = """
+import os, signal, subprocess, sys, time
+code = "import signal, time; signal.signal(15, signal.SIG_IGN); print(1, flush=True); time.sleep(600)"
+child = subprocess.Popen([sys.executable, "-c", code], start_new_session=True, stdout=subprocess.PIPE)
+child.stdout.readline()
+print("child", child.pid, flush=True)
+"""
+
+
+def start(folder: Path, code: str, **settings: float) -> Program:
+    return Program([sys.executable, "-c", code], folder / "program.log", **settings)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2][:3]
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(find_containment() != "subreaper", reason="needs Linux")
+@pytest.mark.parametrize(
+    ("more", "status"),
+    [
+        ("", 0),
+        ("time.sleep(600)", 137),
+        ("os.kill(os.getppid(), 9); time.sleep(600)", 137),
+        ("sys.exit(3)", 3),
+    ],
+    ids=["ends", "killed", "kills its supervisor", "exits"],
+)
+def test_a_child_in_a_session_of_its_own_ends_with_its_program(tmp_path: Path, more: str, status: int) -> None:
+    program = start(tmp_path, CHILD + more)
+    line = program.wait_for("child", 60.0)
+    assert line is not None
+    if status == 137 and "getppid" not in more:
+        program.kill()
+    assert program.wait(60.0) == status
+    program.end()
+    assert not is_running(int(line.split()[1]))
+
+
+def test_output_is_bounded_and_read_although_the_file_was_replaced(tmp_path: Path) -> None:
+    code = "import os, sys; os.unlink('program.log'); sys.stdout.write('x' * 100 + '\\n')"
+    program = Program([sys.executable, "-c", code], tmp_path / "program.log", folder=tmp_path, output_bytes=60)
+    assert program.wait(60.0) == 0
+    program.end()
+    assert program.is_output_cut
+    assert program.read_output() == "x" * 60 + "\n41 more bytes of output were dropped\n"
+    assert program.last_line == "41 more bytes of output were dropped"
+
+
+@pytest.mark.parametrize("file", ["link", "sub/file", "sub/../file", "../file", "/etc/passwd", "."])
+def test_files_behind_links_or_outside_the_folder_are_refused(tmp_path: Path, file: str) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "link").symlink_to(tmp_path / "file")
+    (folder / "sub").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="without symbolic links"):
+        check_no_symlinks(folder, file)
+    check_no_symlinks(folder, "file")
