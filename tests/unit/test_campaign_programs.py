@@ -7,10 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from recorder.reader import Recording
 from replays.campaigns.equipment.cleanup import find_containment
 from replays.campaigns.equipment.process import Program
-from replays.campaigns.files.case_results import check_no_symlinks
+from replays.campaigns.files.case_results import CaseRecording
 from rig.base.errors import InputError
+from tests import waiting
+from tests.processes import ROOT
 
 pytestmark = [pytest.mark.wallclock]
 CHILD = """
@@ -18,12 +21,14 @@ import os, signal, subprocess, sys, time
 code = "import signal, time; signal.signal(15, signal.SIG_IGN); print(1, flush=True); time.sleep(600)"
 child = subprocess.Popen([sys.executable, "-c", code], start_new_session=True, stdout=subprocess.PIPE)
 child.stdout.readline()
-print("child", child.pid, flush=True)
+with open("child.new", "w") as file:
+    file.write(str(child.pid))
+os.rename("child.new", "child")
 """
 
 
 def start(folder: Path, code: str, **settings: float) -> Program:
-    return Program([sys.executable, "-c", code], folder / "program.log", **settings)
+    return Program([sys.executable, "-c", code], folder / "program.log", folder=folder, **settings)
 
 
 def is_running(pid: int) -> bool:
@@ -46,13 +51,12 @@ def is_running(pid: int) -> bool:
 )
 def test_a_child_in_a_session_of_its_own_ends_with_its_program(tmp_path: Path, more: str, status: int) -> None:
     program = start(tmp_path, CHILD + more)
-    line = program.wait_for("child", 60.0)
-    assert line is not None
+    waiting.until((tmp_path / "child").exists)
     if status == 137 and "getppid" not in more:
         program.kill()
     assert program.wait(60.0) == status
     program.end()
-    assert not is_running(int(line.split()[1]))
+    assert not is_running(int((tmp_path / "child").read_text()))
 
 
 def test_output_is_bounded_and_read_although_the_file_was_replaced(tmp_path: Path) -> None:
@@ -71,6 +75,8 @@ def test_files_behind_links_or_outside_the_folder_are_refused(tmp_path: Path, fi
     folder.mkdir()
     (folder / "link").symlink_to(tmp_path / "file")
     (folder / "sub").symlink_to(tmp_path)
+    seen = CaseRecording(Recording.open(ROOT / "replays/sessions/hammer-6.2.mcap"), folder)
     with pytest.raises(InputError, match="without symbolic links"):
-        check_no_symlinks(folder, file)
-    check_no_symlinks(folder, "file")
+        seen.card(file, None, None)
+    with pytest.raises(InputError, match="a file that ends in"):
+        seen.card("file", None, None)

@@ -56,7 +56,8 @@ class Program:
             weakref.finalize(self, os.close, self._output)
             self._supervisor = subprocess.Popen(
                 [sys.executable, "-I", "-S", str(_SUPERVISOR), str(output_bytes), str(end_s), *self.command],
-                stdin=subprocess.PIPE, stdout=self._output, stderr=subprocess.STDOUT, cwd=folder, env=environment,
+                bufsize=0, stdin=subprocess.PIPE, stdout=self._output, stderr=subprocess.STDOUT, cwd=folder,
+                env=environment,
                 start_new_session=True,  # Ctrl-C is sent to the test only, which ends its programs in order
             )  # fmt: skip
         except OSError as error:

@@ -92,14 +92,14 @@ class CaseRecording:
 
         key = file, limits, path, channels
         if key not in self._cards:
-            check_no_symlinks(self.folder, file)
+            _check_no_symlinks(self.folder, file)
             sent = [part.path for part in self.recording.parts]
             loaded = load_limits(limits)
             self._cards[key] = judge(self.folder / file, sent, limits=loaded, path=path, channels=channels)
         return self._cards[key]
 
 
-def check_no_symlinks(folder: Path, file: str) -> None:
+def _check_no_symlinks(folder: Path, file: str) -> None:
     """Refuse a device's file outside its folder, or behind a symbolic link, which could lead to any file.
 
     Raises:
