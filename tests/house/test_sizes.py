@@ -34,7 +34,7 @@ BUDGETS = {
     "recorder/output": 544,
     "recorder/viewer": 1893,
     "replays": 0,
-    "replays/campaigns": 2793,
+    "replays/campaigns": 2794,
     "replays/estimate": 337,
     "replays/player": 816,
     "replays/recordings": 10317,
