@@ -29,13 +29,13 @@ from drivers.daq import Daq
 from drivers.link import LinkTimeoutError
 from drivers.sources import Source
 from drivers.sources.rig import RigSource
-from drivers.sources.samples import ALL_AVAILABLE, RowReader, Samples, StreamEndedError, follow, merge_samples
+from drivers.sources.samples import ALL_AVAILABLE, RIG_LOST, RowReader, Samples, StreamEndedError, follow, merge_samples
 from drivers.sources.stream import RigStream
 from drivers.sources.turns import PULSE_LEVEL, Turn, find_pulses, measure_turn
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
 from rig.serve.stream_check import BlockEnd, Catalogue, parse_block_end
-from rig.serve.transport import DEFAULT_ENDPOINT, Client
+from rig.serve.transport import DEFAULT_ENDPOINT, Client, RigLostError
 from rig.serve.waiting import Deadline
 
 _SILENCE_S = 10.0
@@ -223,6 +223,7 @@ class Rig(Console):
             InputError: The duration is not a number, or shorter than one sample.
             NotSeenError: The rig sent nothing for 10 s.
             StreamEndedError: The run has ended.
+            RigLostError: The rig was lost.
         """
         rows = round(duration_s * self.daq.rate_hz) if 0.0 < duration_s < math.inf else 0
         if rows < 1:
@@ -244,6 +245,7 @@ class Rig(Console):
             InputError: The condition does not return one boolean per sample.
             NotSeenError: No sample met the condition in this time.
             StreamEndedError: The run ended first.
+            RigLostError: The rig was lost.
         """
         rate = self.daq.rate_hz
         if not 0.0 < within_s < math.inf:
@@ -283,6 +285,7 @@ class Rig(Console):
         Raises:
             InputError: The keyphasor is not among the channels, or the rate is too low for its pulse.
             NotSeenError: No pulse came.
+            RigLostError: The rig was lost.
         """
         daq = self.daq
         if "keyphasor" not in daq.channels:
@@ -329,6 +332,7 @@ class Rig(Console):
             InputError: The client was opened without channels.
             RefusedError: The rig has removed this device, for the reason in the message.
             NotSeenError: A rig that is not in lockstep sent nothing for 10 s.
+            RigLostError: The rig was lost.
         """
         daq = self.daq
         if self.pace == "lockstep":
@@ -362,7 +366,7 @@ class Rig(Console):
             if wire.ENDED not in str(error):
                 raise
         except ConnectionError:
-            if self.daq.ended is None:
+            if (reason := self.daq.ended) is None or reason.startswith(RIG_LOST):
                 raise
         finally:
             self._timeout_s = usual_timeout_s
@@ -373,6 +377,7 @@ class Rig(Console):
 
         Raises:
             RefusedError: The rig removed the device.
+            RigLostError: The rig was lost.
         """
         while True:
             with contextlib.suppress(queue.Empty):
@@ -380,7 +385,9 @@ class Rig(Console):
                     return end
             if self._removal:
                 raise RefusedError(f"the rig has removed {self._name}: {self._removal}")
-            if self.daq.ended is not None:
+            if (reason := self.daq.ended) is not None:
+                if reason.startswith(RIG_LOST):
+                    raise RigLostError(reason)
                 return None
 
     def _on_block_end(self, _: str, payload: bytes) -> None:
@@ -457,6 +464,7 @@ class Rig(Console):
 
         Raises:
             NotSeenError: No such event came.
+            RigLostError: The rig was lost.
         """
         wanted = (lambda event: event["event"] == what) if isinstance(what, str) else what
         deadline = Deadline(timeout_s)
@@ -467,6 +475,9 @@ class Rig(Console):
             try:
                 event = self._events.get(timeout=deadline.left_s)
             except queue.Empty:
+                self._check_rig()
+                if self._daq is not None and (self._daq.ended or "").startswith(RIG_LOST):
+                    raise RigLostError(RIG_LOST) from None
                 others = ", ".join(dict.fromkeys(event["event"] for event in self._other_events)) or "none"
                 raise NotSeenError(f"no such event in {timeout_s:g} s; received instead: {others}") from None
             if wanted(event):
@@ -474,6 +485,8 @@ class Rig(Console):
             self._other_events.append(event)
 
     def _on_event(self, event: dict[str, Any]) -> None:
+        if self._rig is not None and self._client.rig not in (None, self._rig):
+            return  # of the rig that runs there now
         self._events.put(event)
         if event["event"] == "device" and event.get("device") == self._name:
             lost = event.get("state") == "lost"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partialmethod
@@ -14,7 +15,8 @@ from rig.base import wire
 from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError
 from rig.run.commands import SUMMARIES
-from rig.serve.transport import DEFAULT_ENDPOINT, Client, NoReplyError
+from rig.serve.devices import describe_waits
+from rig.serve.transport import DEFAULT_ENDPOINT, Client, NoReplyError, RigLostError
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +69,14 @@ class Console(Closing):
         client: Transport to the rig; `close` closes it too.
         name: Name of this console in the stream's events; by default it contains the process id.
         timeout_s: Longest wait for a reply [s].
+        any_rig: Send commands to whichever rig runs, also to one that was started later.
 
     Example:
         With a rig that runs: `with Console.open("zenoh:127.0.0.1:7460") as console`. Here with a stand-in that accepts
         every command:
 
         >>> class Rig:
+        ...     rig = None
         ...     def request(self, key, payload=b"", *, timeout_s):
         ...         return b'{"accepted": true, "id": 1, "tick": 2500, "time_s": 0.0025}'
         >>> console = Console(Rig())
@@ -83,10 +87,16 @@ class Console(Closing):
         rig.base.errors.InputError: speed_hz must be a finite number; received nan
     """
 
-    def __init__(self, client: Client, *, name: str | None = None, timeout_s: float = 5.0) -> None:
+    def __init__(
+        self, client: Client, *, name: str | None = None, timeout_s: float = 5.0, any_rig: bool = False
+    ) -> None:
         self._client = client
         self._name = name or f"console pid {os.getpid()}"
         self._timeout_s = timeout_s
+        self._rig = None if any_rig else client.rig
+        """Identity of the rig; None if any will do, or over CAN."""
+        self._secret = secrets.token_hex(16)
+        """Secret of the devices that this console joins: no other client can end their blocks or remove them."""
 
     @classmethod
     def open(cls, url: str = "zenoh:" + DEFAULT_ENDPOINT, *, name: str | None = None, wait_s: float = 3.0) -> Self:
@@ -120,6 +130,7 @@ class Console(Closing):
         Raises:
             InputError: A field is not a finite number.
             NoReplyError: The rig did not reply in time.
+            RigLostError: Another rig runs there now.
             RefusedError: The rig refused the command, for the reason in the message.
         """
         reply = self._request(command, timeout_s, **fields)
@@ -221,7 +232,7 @@ class Console(Closing):
         Raises:
             RefusedError: The rig is not in lockstep, or a device of this name has joined.
         """
-        return self.send("join", device=device or self._name, patience_s=float(patience_s))
+        return self.send("join", device=device or self._name, patience_s=float(patience_s), secret=self._secret)
 
     def done(self, tick: int, device: str | None = None) -> Accepted:
         """Report that a device has processed all blocks up to a tick.
@@ -233,7 +244,7 @@ class Console(Closing):
         Raises:
             RefusedError: The device was removed, or no block ends at this tick and the device is removed now.
         """
-        return self.send("done", device=device or self._name, tick=tick)
+        return self.send("done", device=device or self._name, tick=tick, secret=self._secret)
 
     def leave(self, device: str | None = None) -> Accepted:
         """Unregister a device: the rig no longer waits for it.
@@ -244,7 +255,7 @@ class Console(Closing):
         Raises:
             RefusedError: The device has not joined.
         """
-        return self.send("leave", device=device or self._name)
+        return self.send("leave", device=device or self._name, secret=self._secret)
 
     def step_blocks(self, blocks: int, *, timeout_s: float = 600.0) -> Accepted:
         """Play a number of blocks of a paused replay; return when they are published.
@@ -310,6 +321,7 @@ class Console(Closing):
 
     def status(self) -> dict[str, Any]:
         """Return the rig's status document, which is also published twice a second."""
+        self._check_rig()
         return wire.decode_document(self._client.request(wire.STATUS, timeout_s=self._timeout_s))
 
     @property
@@ -317,25 +329,33 @@ class Console(Closing):
         """Certificates by which rig and console have authenticated each other; None without TLS."""
         return getattr(self._client, "connection", None)
 
+    def _check_rig(self) -> None:
+        """Raise an error if the linked rig is another one than at the start."""
+        if self._rig is not None and self._client.rig not in (None, self._rig):
+            raise RigLostError("the rig was lost, and another runs there now: connect again")
+
     def _describe_wait(self) -> str:
         """Return the devices that the rig waits for, as the end of an error message."""
         with contextlib.suppress(NoReplyError):
             rows = self.status().get("devices", ()) if self._client.rig is not None else ()
-            if behind := [f"{row['name']} ({row['behind_s']:.0f} s)" for row in rows if row.get("behind_s")]:
-                return f"; it waits for {', '.join(behind)}"
+            if waits := describe_waits(rows):
+                return f"; {waits}"
         return ""
 
     def _request(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> dict[str, Any]:
         for name, value in fields.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise InputError(name, "a finite number", value)
-        request = wire.encode_document({"from": self._name, **fields})
+        self._check_rig()
+        rig = {} if self._rig is None else {"rig": self._rig}
+        request = wire.encode_document({"from": self._name, **rig, **fields})
         try:
             payload = self._client.request(wire.command_key(command), request, timeout_s=timeout_s or self._timeout_s)
         except NoReplyError as error:
             raise NoReplyError(f"{error}{self._describe_wait()}") from None
         reply = wire.decode_document(payload)
         if not reply.get("accepted"):
+            self._check_rig()
             raise RefusedError(str(reply.get("error", f"the rig refused {command} without a reason")))
         return reply
 

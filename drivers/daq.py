@@ -24,6 +24,7 @@ from drivers.sources.samples import RowBuffer, RowReader, Samples, StreamEndedEr
 from rig.base.closeable import Closing
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.wire import Continuity, Gap
+from rig.serve.transport import RigLostError
 
 _MAX_GAPS = 1000
 """Number of gaps that are kept in detail; all are counted."""
@@ -279,6 +280,9 @@ class Daq(RowReader, Closing):
                     continue
                 except StreamEndedError:
                     return
+                except RigLostError as error:
+                    self._error = error
+                    return
                 try:
                     function(samples)
                 except BaseException as error:
@@ -298,7 +302,7 @@ class Daq(RowReader, Closing):
             Whether all samples were passed on in time.
 
         Raises:
-            BaseException: The function's exception, which ended the calls.
+            BaseException: The function's exception, which ended the calls; RigLostError: the rig was lost.
         """
         if self._thread is None:
             raise InputError("wait", "called after call", Words("no function"))

@@ -71,8 +71,8 @@ DEFECTS = [
     Defect("a danger does not trip", "alarms", "        machine.stop()", "        pass", "__main__.py"),
     Defect("trips again without a reset", "retrip", "np.logical_or.accumulate(trip) | self.tripped", "trip"),
     Defect(
-        "trips without a report", "alarms", 'machine.note(str(action), tags=["protection", action.kind])',
-        'action.kind == "trip" or machine.note(str(action), tags=["protection", action.kind])', "__main__.py",
+        "trips without a report", "alarms", 'report(machine, str(action), action.kind, show)',
+        'action.kind == "trip" or report(machine, str(action), action.kind, show)', "__main__.py",
     ),
     # latch and reset
     Defect("danger does not latch", "latch", '{"danger", "overspeed"} if', '{"overspeed"} if'),

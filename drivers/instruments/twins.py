@@ -35,7 +35,7 @@ class Twins(Closing):
 
     def serve(self, kind: type[Twin], port: Port) -> Twin:
         """Serve one instrument at a port; `close` closes the port."""
-        twin = kind(self._stream, Console(self._client, name=f"{kind.CODEC.address.name} twin"), port)
+        twin = kind(self._stream, Console(self._client, name=f"{kind.CODEC.address.name} twin", any_rig=True), port)
         self._closing.callback(twin.close)
         self.twins.append(twin)
         return twin

@@ -11,13 +11,17 @@ import argparse
 import contextlib
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, Literal, get_args, get_origin
 
 from drivers.protection.monitor import Action, Protection
 from drivers.protection.settings import Settings
 from rig.base.checks import check
-from rig.base.errors import InputError
+from rig.base.errors import InputError, RefusedError
 from rig.serve.transport import DEFAULT_ENDPOINT
+
+_MAX_NOTE = 1000
+"""Longest text of a note [characters]."""
 
 
 def protect(machine: Any, protection: Protection, show: Callable[[str], object] = print) -> None:
@@ -50,16 +54,28 @@ def take_input(protection: Protection, tags: Iterable[str], text: str) -> None:
 
 
 def act(machine: Any, settings: Settings, actions: Iterable[Action], show: Callable[[str], object] = print) -> None:
-    """Perform the monitor's actions: the trip first, then the notes. A stop comes last, as it ends the notes too."""
+    """Report the monitor's actions, then trip if one is a trip; a refused trip is reported too."""
     actions = list(actions)
-    trips = [action for action in actions if action.kind == "trip"]
-    if trips and settings.trip == "speed 0":
-        machine.speed(0.0)
     for action in actions:
         show(str(action))
-        machine.note(str(action), tags=["protection", action.kind])
-    if trips and settings.trip == "stop":
-        machine.stop()
+        report(machine, str(action), action.kind, show)
+    for trip in [action for action in actions if action.kind == "trip"]:
+        try:
+            if settings.trip == "stop":
+                machine.stop()
+            else:
+                machine.speed(0.0)
+        except RefusedError as error:
+            show(line := f"{trip.time_s:.6f} s  trip-refused  {error}")
+            report(machine, line, "trip-refused", show)
+
+
+def report(machine: Any, line: str, kind: str, show: Callable[[str], object] = print) -> None:
+    """Add a line to the stream as a note; a refusal is shown, and does not end the monitor."""
+    try:
+        machine.note(line[:_MAX_NOTE], tags=["protection", kind])
+    except InputError as error:
+        show(f"note refused: {error}")
 
 
 def _events(machine: Any) -> list[dict[str, Any]]:
@@ -100,15 +116,16 @@ def parse(arguments: Sequence[str]) -> tuple[str, Settings]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Protect the rig at a URL until its run ends, or Ctrl-C."""
+    """Protect the rig at a URL until its run ends, or Ctrl-C; exit status 2 for wrong input or a lost rig."""
     from drivers.client import connect
 
     try:
         url, settings = parse(sys.argv[1:] if arguments is None else arguments)
         with connect(url, channels=settings.channels, name="protection") as machine:
-            machine.note(f"protection of {settings.x}, {settings.y} started", tags=["protection", "on"])
-            print(f"Connected to {url}: {', '.join(settings.channels)}; Ctrl-C ends it", flush=True)
-            protect(machine, Protection(settings), lambda line: print(line, flush=True))
+            show = partial(print, flush=True)
+            show(f"Connected to {url}: {', '.join(settings.channels)}; Ctrl-C ends it")
+            report(machine, f"protection of {settings.x}, {settings.y} started", "on", show)
+            protect(machine, Protection(settings), show)
     except KeyboardInterrupt:
         return
     except (ConnectionError, TimeoutError, EOFError, InputError) as error:

@@ -20,11 +20,13 @@ import numpy as np
 from drivers.can.message import CanMessage, MessageTable
 from drivers.can.signals import RigState, default_messages, messages_for
 from drivers.link import LinkTimeoutError
-from drivers.sources.samples import Samples
-from drivers.sources.stream import RIG_LOST, decimation_factor
-from rig.base.errors import InputError
+from drivers.sources.samples import RIG_LOST, Samples
+from drivers.sources.stream import decimation_factor
+from rig.base import wire
+from rig.base.errors import InputError, RefusedError
 from rig.channels.channel_file import read_channels
 from rig.channels.table import default_table
+from rig.serve.transport import RigLostError
 from rig.serve.waiting import Deadline
 
 _SILENCE_TIMEOUT_S = 3.0
@@ -173,7 +175,10 @@ class CanSource:
         """Index of the latest Sync as sent, while Rates is missing."""
         self._clock_s: int | None = None
         """Simulated time of the latest Clock [s]."""
-        self._end_us = 0
+        self._beat: dict[str, int] | None = None
+        """Raw values of the latest Heartbeat."""
+        self._is_restarted = False
+        self._end_reason: str | None = None
         self._rates_known = threading.Event()
         self._early: deque[tuple[int, bytes]] = deque(maxlen=_MAX_EARLY_FRAMES)
         self._batch: dict[int, list[bytes]] = {}
@@ -231,9 +236,13 @@ class CanSource:
 
         Raises:
             LinkTimeoutError: The bus did not accept the frame within 1 s.
+            RigLostError: The rig was lost, or another runs there now.
+            RefusedError: The run has ended.
         """
         import can
 
+        if (reason := self._end_reason) is not None:
+            raise RigLostError(reason) if reason.startswith(RIG_LOST) else RefusedError(wire.ENDED)
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=1.0)
         except (can.CanError, OSError, ValueError) as error:
@@ -266,20 +275,24 @@ class CanSource:
     def _read(self) -> None:
         import can
 
-        last_frame_s = last_delivery_s = time.monotonic()
-        beat = None
+        last_poll_s = last_delivery_s = time.monotonic()
+        beat, silence_s = None, 0.0
         while not self._closed:
             try:
                 message = self._bus.recv(_BATCH_S)
             except (can.CanError, OSError, ValueError):
                 break
             now = time.monotonic()
+            # If this process was suspended, that time is no silence of the bus.
+            silence_s, last_poll_s = silence_s + min(now - last_poll_s, 10 * _BATCH_S), now
             if message is not None:
                 if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
-                    last_frame_s = now
+                    silence_s = 0.0
                     state = self.take(message.arbitration_id, bytes(message.data))
                     beat = beat if state is None else state
-            elif self._on_samples is not None and now - last_frame_s > _SILENCE_TIMEOUT_S:
+                    if self._is_restarted:
+                        break
+            elif self._on_samples is not None and silence_s > _SILENCE_TIMEOUT_S:
                 break
             if now - last_delivery_s > _BATCH_S:
                 last_delivery_s = now
@@ -315,15 +328,19 @@ class CanSource:
             state = raw["state"]
             self._other_layout = raw["layout"] if raw["layout"] not in (0, self._table.layout) else 0
             self.lockstep |= state == RigState.LOCKSTEP
-            self._end_us = raw["time"]
+            if (last := self._beat) is not None:
+                # The time of one rig never steps back, and it prepares once.
+                stepped_back = (raw["time"] - last["time"]) % _WRAP >= _WRAP // 2
+                self._is_restarted |= stepped_back or state == RigState.PREPARING != last["state"]
+            self._beat = raw
         if self._new_sync is not None and self.rates is not None and (rate_hz := self.rates["rate"]):
             near = (self._sync or 0) if self._clock_s is None else self._clock_s * rate_hz
             self._sync, self._new_sync = full_index(self._new_sync, near), None
             if self._on_frame is not None:
                 self._on_frame("Sync", {"index": self._sync, "rate": rate_hz})
-        if self.lockstep and self._sync is None and self.rates is not None:
+        if self.lockstep and self._sync is None and self.rates is not None and self._beat is not None:
             # No Sync before the first step: the next samples follow the last block.
-            self._sync = self._end_us * self.rates["rate"] // 1_000_000
+            self._sync = self._beat["time"] * self.rates["rate"] // 1_000_000
         if self._on_frame is not None and row.name != "Sync":
             self.deliver()
             self._on_frame(row.name, raw)
@@ -349,6 +366,7 @@ class CanSource:
 
     def _finish(self, reason: str) -> None:
         with self._lock:
+            self._end_reason = reason
             self.deliver()
             end, names = self._on_end, list(self._wanted.values())
         for name in names:

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from itertools import count
 
-from drivers.sources.samples import Samples
+from drivers.sources.samples import RIG_LOST, Samples
 from drivers.sources.stream import RigStream, decimate, decimation_factor
 from rig.base import wire
 from rig.channels.table import Group
@@ -78,7 +78,7 @@ class RigSource:
 
         def take(block: wire.Block) -> None:
             if block.values.shape[1] != len(units) or round(block.rate_hz / step) != round(rate_hz):
-                on_end(group.name, "the rig's channels or rates have changed")
+                on_end(group.name, f"{RIG_LOST}: its channels or rates have changed")
                 return
             block = decimate(block, step)
             if len(block.values):

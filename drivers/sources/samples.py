@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NoReturn, Self
 
 import numpy as np
 
@@ -15,11 +15,25 @@ from drivers.link import LinkTimeoutError
 from rig.base.errors import InputError
 from rig.base.samples import Columns
 from rig.base.wire import Block, Continuity, row_tick, row_times_s
+from rig.serve.transport import RigLostError
 from rig.serve.waiting import Deadline
+
+RIG_LOST = "the link to the rig is lost"
+"""Beginning of the reason for an end that is not that of the run."""
 
 
 class StreamEndedError(EOFError):
     """The stream has ended; the message gives the reason."""
+
+
+def raise_end(reason: str) -> NoReturn:
+    """Raise the error for the end of a stream.
+
+    Raises:
+        RigLostError: The rig was lost.
+        StreamEndedError: The run has ended, or the reader was closed.
+    """
+    raise (RigLostError if reason.startswith(RIG_LOST) else StreamEndedError)(reason)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -198,6 +212,7 @@ class RowReader:
         Raises:
             LinkTimeoutError: The rows did not arrive in time; those that did can still be read.
             StreamEndedError: The stream has ended, and everything was read.
+            RigLostError: The rig was lost, and everything was read.
         """
         self._check(rows)
         deadline = Deadline(timeout_s)
@@ -212,7 +227,7 @@ class RowReader:
         try:
             while True:
                 yield self.read(ALL_AVAILABLE, timeout_s=0.0, whole=False)
-        except (LinkTimeoutError, StreamEndedError):
+        except (LinkTimeoutError, StreamEndedError, RigLostError):
             return
 
     def blocks(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Iterator[Samples]:
@@ -232,7 +247,7 @@ class RowReader:
         """Return the rows that are ready, or None; the caller holds the lock."""
         ready = self._buffer.take(rows, ended=not whole or self._ended is not None)
         if ready is None and self._ended is not None:
-            raise StreamEndedError(self._ended)
+            raise_end(self._ended)
         return ready
 
     def _wait(self, deadline: Deadline) -> bool:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from drivers.sources.samples import RIG_LOST
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import ChannelTable, Group
@@ -21,7 +22,6 @@ from rig.serve.transport import Client, NoReplyError
 
 GRACE_S = 2.0
 """Silence that ends a stream after an end event without row counts, and longest absence of the rig [s]."""
-RIG_LOST = "the link to the rig is lost"
 
 
 def decimation_factor(native_hz: float, rate_hz: float) -> int:

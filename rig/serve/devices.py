@@ -7,10 +7,18 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 
 _MAX_DEVICES = 64
 """Devices kept for the status. The devices lost first are removed first."""
+MAX_PATIENCE_S = 3600.0
+"""Largest sum of the patience of all joined devices [s]: a block waits for one device after the other."""
+
+
+def describe_waits(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the devices of a status that the rig waits for, and for how long; empty if it waits for none."""
+    behind = [f"{row['name']} ({row['behind_s']:.0f} s)" for row in rows if row.get("behind_s")]
+    return f"the rig waits for {', '.join(behind)}" if behind else ""
 
 
 class DeviceRequest(Protocol):
@@ -23,6 +31,7 @@ class DeviceRequest(Protocol):
 @dataclass(slots=True)
 class _Device:
     patience_s: float
+    secret: str | None
     tick: int
     """End of the last block that it has finished."""
     lost: str | None = None
@@ -47,24 +56,34 @@ class Devices:
         """Return whether any joined device is not lost."""
         return any(device.lost is None for device in self._devices.values())
 
-    def join(self, name: str, patience_s: float, tick: int) -> None:
+    def join(self, name: str, patience_s: float, tick: int, secret: str | None = None) -> None:
         """Add a device, which the run waits for from this tick.
 
+        Args:
+            name: The device.
+            patience_s: Longest wait for it per block [s].
+            tick: Current tick.
+            secret: Required in its further messages; None: all clients may send them.
+
         Raises:
-            InputError: The name is in use, or there are too many devices.
+            InputError: The name is in use, there are too many devices, or their patience is too long.
         """
         if name in self._devices and self._devices[name].lost is None:
             raise InputError("join.device", "a name under which no other device has joined", name)
+        left_s = MAX_PATIENCE_S - sum(device.patience_s for device in self._devices.values() if device.lost is None)
+        if patience_s > left_s:
+            must = f"at most {left_s:g} s, what the joined devices leave of {MAX_PATIENCE_S:g} s"
+            raise InputError("join.patience_s", must, patience_s)
         self._devices.pop(name, None)
         while len(self._devices) >= _MAX_DEVICES:
             removable = next((other for other, device in self._devices.items() if device.lost is not None), None)
             if removable is None:
                 raise InputError("join.device", f"one of at most {_MAX_DEVICES} devices", name)
             del self._devices[removable]
-        self._devices[name] = _Device(patience_s, tick)
+        self._devices[name] = _Device(patience_s, secret, tick)
         self._update_rows()
 
-    def done(self, name: str, tick: int | None, end: int, reported: str) -> str | None:
+    def done(self, name: str, tick: int | None, end: int, reported: str, secret: str | None = None) -> str | None:
         """Record that a device has finished a block.
 
         Args:
@@ -72,27 +91,28 @@ class Devices:
             tick: End of the block according to the device; None if the block does not exist.
             end: End of the last block.
             reported: The block that the device named, for the error.
+            secret: That of the message.
 
         Returns:
             The reason if the device was removed for a wrong tick; otherwise None.
 
         Raises:
-            InputError: The device has not joined.
+            InputError: The device has not joined, or with another secret.
         """
-        device = self._get_joined("done", name)
+        device = self._get_joined("done", name, secret)
         if tick is None or tick not in (device.tick, end):
             return self._remove(name, f"it reported the end of {reported}; the current block ends at tick {end}")
         device.tick = max(tick, device.tick)
         self._update_rows()
         return None
 
-    def leave(self, name: str) -> None:
+    def leave(self, name: str, secret: str | None = None) -> None:
         """Remove a device; the run no longer waits for it.
 
         Raises:
-            InputError: The device has not joined.
+            InputError: The device has not joined, or with another secret.
         """
-        self._get_joined("leave", name)
+        self._get_joined("leave", name, secret)
         del self._devices[name]
         self._update_rows()
 
@@ -160,11 +180,14 @@ class Devices:
             for row in self.rows
         ]
 
-    def _get_joined(self, command: str, name: str) -> _Device:
+    def _get_joined(self, command: str, name: str, secret: str | None) -> _Device:
         device = self._devices.get(name)
         if device is None or device.lost is not None:
             detail = "" if device is None else f" (it was removed: {device.lost})"
             raise InputError(f"{command}.device", f"one that has joined{detail}", name)
+        if secret != device.secret:
+            received = Words("none" if secret is None else "another one")
+            raise InputError(f"{command}.secret", f"that with which {name} has joined", received)
         return device
 
     def _remove(self, name: str, reason: str) -> str:

@@ -19,6 +19,7 @@ from rig.base import wire
 from rig.base.checks import MAX_INTEGER, Name, StrictModel, a_line, check, read_json
 from rig.base.errors import InputError, RefusedError
 from rig.base.text import printable
+from rig.serve.devices import MAX_PATIENCE_S
 from rig.serve.transport import Server
 from rig.serve.transport.clients import Clients
 from rig.serve.transport.limit import CommandLimit
@@ -59,12 +60,17 @@ class NoteRequest(StrictModel):
     tags: list[Annotated[str, a_line(40), AfterValidator(_check_word)]] = Field(default=[], max_length=10)
 
 
+_Secret = Annotated[str, a_line(64)] | None
+"""Secret that a device has chosen for its join; `done` and `leave` without it are from another client."""
+
+
 class JoinRequest(StrictModel):
     """Registration of a device under test: each block waits until the device has finished the one before."""
 
     device: Name
-    patience_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 10.0
+    patience_s: Annotated[float, Field(gt=0.0, le=MAX_PATIENCE_S)] = 10.0
     """Time limit for the device per block, wall time [s]."""
+    secret: _Secret = None
 
 
 class DoneRequest(StrictModel):
@@ -75,6 +81,7 @@ class DoneRequest(StrictModel):
     """End of the block; alternative to `block`."""
     block: Annotated[int, Field(ge=0, le=MAX_INTEGER)] | None = None
     """Number of the block; alternative to `tick`."""
+    secret: _Secret = None
 
     @model_validator(mode="after")
     def _require_one(self) -> DoneRequest:
@@ -87,6 +94,7 @@ class LeaveRequest(StrictModel):
     """End of a device's registration."""
 
     device: Name
+    secret: _Secret = None
 
 
 class SeekRequest(StrictModel):
@@ -212,7 +220,10 @@ class RequestHandler:
         if name not in self._commands:
             raise InputError("command", f"one of {', '.join(self._commands)}", name)
         request = read_json(payload, field=name, most_bytes=REQUEST_BYTES)
-        sender = check(_SenderField, {"from": request.pop("from", "unknown")}, field="").sender
+        origin = check(_Origin, {name: request.pop(name) for name in ("from", "rig") if name in request}, field="")
+        if origin.rig is not None and origin.rig not in self._server.identities:
+            raise RefusedError(f"{name} was sent to another rig, which ran here before: connect again")
+        sender = origin.sender
         if name not in ("step", "done", "stop"):
             self._limit.check(sender)
         model = REQUESTS.get(name)
@@ -305,8 +316,11 @@ def _size(command: dict[str, Any]) -> int:
     return len(wire.encode_document(command))
 
 
-class _SenderField(StrictModel):
-    sender: Name = Field(alias="from")
+class _Origin(StrictModel):
+    """Fields of every command: the sender, and the rig that it means."""
+
+    sender: Annotated[Name, Field(alias="from")] = "unknown"
+    rig: Annotated[str, a_line(64)] | None = None
 
 
 def refusal(error: Exception) -> dict[str, Any]:

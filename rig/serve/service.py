@@ -21,7 +21,7 @@ from rig.base.text import replace_nonfinite
 from rig.channels.faults import TRANSPORTS, Message
 from rig.run.commands import SUMMARIES
 from rig.run.commands.table import SERVICE_COMMANDS
-from rig.serve.devices import Devices
+from rig.serve.devices import Devices, describe_waits
 from rig.serve.pacing import Clock, Lockstep, RealTime
 from rig.serve.request_handler import (
     CommandHistory,
@@ -49,6 +49,8 @@ _MAX_STEP_S = 3600
 """Longest single step [s of simulated time]."""
 _DEVICE_WAIT_S = 0.1
 """Longest single wait for devices, unless one must be removed sooner [s]."""
+_WAIT_WARNING_S = 5.0
+"""Wait for devices above which a warning is shown [s]."""
 _MAX_HELD = 256
 """Commands that may wait for other devices."""
 _UNLIMITED_HZ = 1e9
@@ -177,6 +179,9 @@ class Service(ServedRun):
         waiting_s = queue.used * self._block_ticks / self._rate
         if self._may_drop and waiting_s > _QUEUE_WARNING_S:
             warnings.append(f"{waiting_s:.1f} s of blocks wait: a client holds up the publisher")
+        devices = self._devices.status_rows(*self._notified, time.monotonic())
+        if (waits := describe_waits(devices)) and max(row["behind_s"] for row in devices) > _WAIT_WARNING_S:
+            warnings.append(waits)
         status = self._status(
             tick=self._tick,
             end_s=None if end_tick is None else end_tick / self._rate,
@@ -192,7 +197,7 @@ class Service(ServedRun):
             health=self._health,
             warnings=warnings,
         )
-        return {**status, "devices": self._devices.status_rows(*self._notified, time.monotonic())}
+        return {**status, "devices": devices}
 
     def _warn(self, text: str) -> None:
         self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
@@ -281,6 +286,8 @@ class Service(ServedRun):
         since_s = since_s if notified_tick == tick else now_s
         late, left_s = self._devices.remove_late(tick, since_s, now_s, {pending.sender for pending in self._waiting})
         self._defer([*events, *(self._device_event(name, "lost", reason=reason) for name, reason in late.items())])
+        if now_s - since_s > _WAIT_WARNING_S:
+            self._handler.warn(describe_waits(self._devices.status_rows(tick, since_s, now_s)))
         if not late:
             self._clock.hold(min(left_s, _DEVICE_WAIT_S))
 
@@ -345,7 +352,7 @@ class Service(ServedRun):
             by_block = arguments.block is not None
             end = self._ends.get(arguments.block) if by_block else arguments.tick
             text = f"block {arguments.block}" if by_block else f"tick {end}"
-            reason = self._devices.done(name, end, tick, text)
+            reason = self._devices.done(name, end, tick, text, arguments.secret)
             if reason is not None:
                 must = f"with tick {tick}, the end of the last block ({self._blocks})"
                 pending.refuse(InputError("done", must, Words(text)))
@@ -354,10 +361,10 @@ class Service(ServedRun):
             pending.answer({"accepted": True, "id": 0, "command": "done", "tick": tick, "time_s": tick / self._rate})
             return None
         if isinstance(arguments, JoinRequest):
-            self._devices.join(name, arguments.patience_s, tick)
+            self._devices.join(name, arguments.patience_s, tick, arguments.secret)
             pending.answer(self._accept(pending, tick))
             return self._device_event(name, "joined", **{"from": pending.sender}, patience_s=arguments.patience_s)
-        self._devices.leave(name)
+        self._devices.leave(name, arguments.secret)
         pending.answer(self._accept(pending, tick))
         return self._device_event(name, "left", **{"from": pending.sender})
 

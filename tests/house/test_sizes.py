@@ -21,13 +21,13 @@ LONGEST_FUNCTION = 120
 SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
-    "drivers": 685,
-    "drivers/can": 4513,
+    "drivers": 709,
+    "drivers/can": 4516,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
-    "drivers/protection": 350,
-    "drivers/sources": 967,
+    "drivers/protection": 362,
+    "drivers/sources": 984,
     "recorder": 1343,
     "recorder/contents": 1267,
     "recorder/files": 822,
@@ -45,10 +45,10 @@ BUDGETS = {
     "rig": 53,
     "rig/base": 921,
     "rig/channels": 2417,
-    "rig/cli": 5220,
+    "rig/cli": 5222,
     "rig/physics": 5456,
     "rig/run": 1821,
-    "rig/serve": 2849,
+    "rig/serve": 2889,
 }
 _NO_CODE = (
     tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER,

@@ -112,7 +112,7 @@ def test_a_client_is_informed_that_the_rig_waits_for_a_device() -> None:
     with bench() as (machine, endpoint), processes.start_python("-c", WAITS, f"zenoh:{endpoint}", "60") as device:
         machine.event("device", timeout_s=60.0)
         device.send_signal(signal.SIGSTOP)
-        with pytest.raises(NoReplyError, match=r"does not answer rig/command/step; it waits for a \(\d+ s\)$"):
+        with pytest.raises(NoReplyError, match=r"does not answer rig/command/step; the rig waits for a \(\d+ s\)$"):
             machine.step(10_000, timeout_s=1.0)
         (row,) = machine.status()["devices"]
         assert (row["state"], row["tick"]) == ("joined", 0)
@@ -150,6 +150,8 @@ def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
                 ticks.append((samples.tick, device.hammer(force_n=80.0).tick))
                 if len(ticks) == 3:
                     break
+                with pytest.raises(RefusedError, match=r"leave\.secret must be that with which CAN 3 has joined"):
+                    machine.leave("CAN 3")
             fault = device.fault("P_E", "gain", factor=2.0)
             steps.join(PATIENCE_S)
             assert ticks == [(0, 10_000), (10_000, 20_000), (20_000, 30_000)]

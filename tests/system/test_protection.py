@@ -7,6 +7,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 import rig
 from drivers.protection import Protection
@@ -38,6 +39,32 @@ def run_until_trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
             events = [machine.event(lambda event: event["event"] in ("speed", "note")) for _ in range(len(lines) + 2)]
         child.wait(timeout=PATIENCE_S)
     return lines, [{**event, "wall_s": 0.0} for event in events], rows
+
+
+@pytest.mark.parametrize("transport", ["zenoh", "can"])
+def test_a_monitor_whose_trip_is_refused_reports_it_and_monitors_to_the_end(transport: str) -> None:
+    """A test signal has no drive: the rig refuses the speed."""
+    can = f"zenoh:can0?endpoint={processes.free_endpoint()}"
+    changes = ("--set", "generator.amplitude_v=2.2", "--set", "generator.frequency_hz=50")
+    with processes.running_rig("test-sine", *changes, "--pace", "lockstep", "--can", can) as (_, endpoint):
+        url = f"zenoh:{endpoint}" if transport == "zenoh" else f"can:{can}&node=4"
+        options = ("--alert-um", "500", "--danger-um", "1010", "--startup-s", "0.02", "--danger-delay-s", "0.01")
+        with (
+            rig.connect(f"zenoh:{endpoint}", channels=["disk_x"], wait_s=PATIENCE_S) as machine,
+            processes.start_python("-m", "drivers.protection", url, *options) as device,
+        ):
+            assert machine.event("device", timeout_s=60.0)["state"] == "joined"
+            machine.advance(0.5)
+            assert machine.lost == {}, "it still takes part"
+            if transport == "zenoh":
+                notes = [machine.event("note")["tags"][-1]]
+                while notes[-1] != "trip-refused":
+                    notes.append(machine.event("note")["tags"][-1])
+                assert "trip" in notes, "it is reported first"
+            machine.stop()
+            output, errors = device.communicate(timeout=60.0)
+    assert (device.returncode, errors) == (0, "")
+    assert "trip-refused  speed" in output
 
 
 def test_an_impact_trips_the_rig_at_the_end_of_its_block_reproducibly() -> None:

@@ -146,15 +146,16 @@ MUTANTS = [
     Mutant("no start-up", "no_alarm_during_start_up", "first + self._rows(settings.startup_s)", "first"),
     Mutant("trips again and again", "a_monitor_trips_once", "np.logical_or.accumulate(trip) | self.tripped", "trip"),
     Mutant(
-        "trip not sent", "a_trip_is_sent_once_and_first", "        machine.speed(0.0)", "        pass", runner,
+        "trip not sent", "a_trip_is_sent_once_after_its_report", "                machine.speed(0.0)",
+        "                pass", runner,
     ),
     Mutant(
-        "trip sent with each note", "a_trip_is_sent_once_and_first", "        show(str(action))",
+        "trip sent with each note", "a_trip_is_sent_once_after_its_report", "        show(str(action))",
         "        show(str(action))\n        machine.speed(0.0)", runner,
     ),
     Mutant(
-        "trip sent by each danger", "a_trip_is_sent_once_and_first", 'if action.kind == "trip"]',
-        'if action.kind != "clear"]\n    machine.speed(0.0) if len(trips) > 1 else None', runner,
+        "trip sent by each danger", "a_trip_is_sent_once_after_its_report", 'if action.kind == "trip"]',
+        'if action.kind != "alert"]', runner,
     ),
     Mutant(
         "own notes reset it", "a_note_of_others_resets_alarms",

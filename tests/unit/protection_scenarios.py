@@ -359,9 +359,9 @@ class FakeMachine:
 
 
 @scenario
-def a_trip_is_sent_once_and_first(device: Any) -> None:
+def a_trip_is_sent_once_after_its_report(device: Any) -> None:
     notes = [("note", ["protection", kind]) for kind in ("alert", "danger", "trip")]
-    for trip, expected in (("speed 0", [("speed", 0.0), *notes]), ("stop", [*notes, ("stop", None)])):
+    for trip, expected in (("speed 0", [*notes, ("speed", 0.0)]), ("stop", [*notes, ("stop", None)])):
         given, machine, lines = settings(trip=trip), FakeMachine(), []
         monitor = device.Protection(given)
         for first in (0, 200, 400):

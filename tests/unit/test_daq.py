@@ -9,18 +9,19 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import can  # noqa: TID253 - the subject
 import numpy as np
 import pytest
 
 import drivers.examples
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
-from drivers.can.signals import default_messages
+from drivers.can.signals import RigState, default_messages
 from drivers.console import Console
 from drivers.daq import Aligner, Daq
 from drivers.instruments.force.driver import AsyncForce
@@ -34,6 +35,7 @@ from rig.base import wire
 from rig.base.errors import InputError
 from rig.base.wire import Continuity
 from rig.channels.table import default_table
+from rig.serve.transport import RigLostError
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint, start_python
@@ -292,13 +294,29 @@ def test_an_end_without_row_numbers_waits_for_silence(monkeypatch: pytest.Monkey
         assert sum(map(len, daq)) == 2 * BLOCK
 
 
-def test_a_rig_that_is_killed_ends_the_blocks() -> None:
+def test_a_rig_that_is_killed_raises_after_its_last_rows() -> None:
     with on_memory(channels=["P_N"]) as (rig, daq):
         rig.publish("forces")
         rig.server.close()
-        assert sum(map(len, daq)) == BLOCK
-        with pytest.raises(StreamEndedError, match="the link to the rig is lost"):
+        rows: list[int] = []
+        with pytest.raises(RigLostError, match="the link to the rig is lost"):
+            rows.extend(map(len, daq))
+        assert sum(rows) == BLOCK
+        with pytest.raises(RigLostError):
             daq.read()
+        with pytest.raises(RigLostError):
+            asyncio.run(daq.aread())
+
+
+def test_a_rig_that_is_killed_raises_in_the_program_that_waits_for_its_function() -> None:
+    taken: list[Samples] = []
+    with on_memory(channels=["P_N"]) as (rig, daq):
+        daq.call(taken.append)
+        rig.publish("forces")
+        rig.server.close()
+        with pytest.raises(RigLostError, match="the link to the rig is lost"):
+            daq.wait(timeout_s=10.0)
+    assert sum(map(len, taken)) == BLOCK
 
 
 def test_a_function_is_called_with_each_block() -> None:
@@ -416,10 +434,8 @@ def test_frames_reproduce_the_counts_of_the_recording(layout: str, step: int) ->
 
 
 @contextmanager
-def on_can(layout: Schedule, **options: Any) -> Iterator[tuple[FakeRig, Daq, Gateway]]:
-    import can
-
-    channel = f"daq{next(_numbers)}"
+def on_can(layout: Schedule, *, channel: str = "", **options: Any) -> Iterator[tuple[FakeRig, Daq, Gateway]]:
+    channel = channel or f"daq{next(_numbers)}"
     with MemoryServer(cache=10) as server, MemoryClient(server) as client:
         rig = FakeRig(server)
         bus = can.Bus(channel, "virtual", protocol=can.CanProtocol.CAN_FD)
@@ -459,13 +475,35 @@ def test_a_bus_without_a_rig_is_reported_in_one_line() -> None:
         Daq.open("can:virtual:empty", wait_s=0.1)
 
 
-def test_a_bus_that_falls_silent_ends_the_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_that_falls_silent_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     with on_can(Schedule(classic_hz=1000), channels=["P_N"]) as (_, daq, gateway):
         monkeypatch.setattr("drivers.sources.can._SILENCE_TIMEOUT_S", 0.3)
         gateway.close()
-        assert sum(map(len, daq.blocks(timeout_s=5.0))) == 200
-        with pytest.raises(StreamEndedError, match="the link to the rig is lost"):
-            daq.read()
+        rows: list[int] = []
+        with pytest.raises(RigLostError, match="the link to the rig is lost"):
+            rows.extend(map(len, daq.blocks(timeout_s=5.0)))
+        assert sum(rows) == 200
+
+
+@pytest.mark.parametrize("state", [RigState.PREPARING, RigState.RUNNING])
+def test_a_restarted_rig_on_a_bus_is_another_rig(state: RigState) -> None:
+    """Its first heartbeat comes before its first samples: the state starts again, or the time steps back."""
+    heartbeat = default_messages().by_name["Heartbeat"]
+    sent = heartbeat.encode(state=state, beat=1, counter=0, time=0, layout=default_messages().layout)
+    with (
+        can.Bus(channel := f"daq{next(_numbers)}", "virtual", protocol=can.CanProtocol.CAN_FD) as bus,
+        closing(CanSource(f"virtual:{channel}?fd=true")) as source,
+        on_can(Schedule(classic_hz=1000), channel=channel, channels=["P_N"]),
+        Daq(source, channels=["P_N"]) as daq,
+    ):
+        beats = (heartbeat.decode(each.data) for each in bus if each.arbitration_id == heartbeat.identifier)
+        next(beat for beat in beats if beat["time"] and beat["state"] == RigState.RUNNING)
+        source.send(0x20, bytes(8))
+        bus.send(can.Message(arbitration_id=heartbeat.identifier, data=sent, is_extended_id=False))
+        with pytest.raises(RigLostError, match="the link to the rig is lost"):
+            list(daq.blocks(timeout_s=20.0))
+        with pytest.raises(RigLostError):
+            source.send(0x20, bytes(8))
 
 
 def test_the_end_of_a_run_is_sent_on_the_bus() -> None:

@@ -37,6 +37,7 @@ from drivers.sources.rig import RigSource
 from drivers.sources.samples import Samples, StreamEndedError
 from rig.base.errors import InputError, RefusedError
 from rig.channels.table import default_table
+from rig.serve.transport import RigLostError
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint
@@ -288,7 +289,7 @@ def test_instruments_reconnect_to_a_restarted_rig() -> None:
         with publishing(rig):
             assert len(force.read(3 * BLOCK, timeout_s=20.0)) == 3 * BLOCK
         first.close()
-        with pytest.raises(StreamEndedError, match="the link to the rig is lost"):
+        with pytest.raises(RigLostError, match="the link to the rig is lost"):
             read_on(force)
         rig = FakeRig(closing.enter_context(ZenohServer(endpoint)))
         until(lambda: answers(force))
@@ -426,7 +427,7 @@ def test_a_missing_rig_is_reported(bench: Bench) -> None:
     driver = bench.open("proximity")
     driver.start()
     bench.rig.server.close()
-    with pytest.raises(StreamEndedError, match="the link to the rig is lost"):
+    with pytest.raises(RigLostError, match="the link to the rig is lost"):
         driver.read(1)
     with pytest.raises(LinkError, match="no rig answers"):
         driver.identify()

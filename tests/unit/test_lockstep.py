@@ -16,6 +16,8 @@ from drivers.can.signals import CommandKind, command_frame, default_messages
 from drivers.console import AcceptedStep, Console
 from rig.base import wire
 from rig.base.errors import RefusedError
+from rig.cli.commands.run import status_parts
+from rig.serve import service
 from rig.serve.health import Guard
 from rig.serve.pacing import FreeRun, Lockstep
 from rig.serve.transport.memory import MemoryClient
@@ -120,6 +122,75 @@ def test_a_device_that_hangs_is_removed_and_the_rig_continues() -> None:
     assert (lost["tick"], lost["reason"]) == (BLOCK, reason)
 
 
+@pytest.mark.parametrize("secret", [{}, {"secret": "invented"}])
+@pytest.mark.parametrize(
+    ("command", "fields"), [("done", {"tick": 7}), ("done", {"tick": BLOCK}), ("done", {"block": 5}), ("leave", {})]
+)
+def test_a_message_of_another_client_neither_ends_a_block_nor_removes_the_device(
+    command: str, fields: dict[str, Any], secret: dict[str, str]
+) -> None:
+    with running() as rig:
+        device = Device(rig, "guard")
+        device.join()
+        steps = Steps(rig, BLOCK)
+        device.wait(1)
+        forged = {"from": "guard", "device": "guard", **fields, **secret}
+        reply = rig.listener.client.request(wire.command_key(command), wire.encode_document(forged))
+        received = "another one" if secret else "none"
+        must = f"{command}.secret must be that with which guard has joined; received {received}"
+        assert wire.decode_document(reply)["error"] == must
+        (row,) = rig.console.status()["devices"]
+        assert (row["state"], row["tick"], row["reason"]) == ("joined", 0, None)
+        device.done(BLOCK)
+        assert steps.join()[0].lost == {}
+        device.leave()
+    assert "secret" not in str(rig.listener.events) + str(rig.listener.statuses)
+
+
+def test_a_device_without_a_secret_takes_part_as_before() -> None:
+    with running() as rig:
+        request = rig.listener.client.request
+        for command, fields in (("join", {}), ("done", {"tick": 0}), ("leave", {})):
+            reply = request(wire.command_key(command), wire.encode_document({"device": "old", **fields}))
+            assert wire.decode_document(reply)["accepted"]
+
+
+def test_the_patience_of_all_devices_together_is_limited() -> None:
+    with running() as rig:
+        console = rig.console
+        console.join("debugged", patience_s=3500.0)
+        with pytest.raises(RefusedError, match=r"patience_s must be at most 100 s, what the joined devices leave of"):
+            console.join("b", patience_s=101.0)
+        console.join("b", patience_s=100.0)
+        console.leave("debugged")
+        console.join("c", patience_s=3500.0)
+
+
+def test_a_rig_that_waits_names_the_device_in_status_event_and_output(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "_WAIT_WARNING_S", 0.01)
+    with running() as rig:
+        device = Device(rig, "guard")
+        device.join(patience_s=3600.0)
+        steps = Steps(rig, BLOCK)
+        device.wait(1)
+        until(lambda: any("waits" in event["text"] for event in rig.listener.named("warning")))
+        until(lambda: "the rig waits for guard (0 s)" in rig.console.status()["warnings"])
+        assert "the rig waits for guard (0 s)" in status_parts(rig.service.status())
+        device.done(BLOCK)
+        steps.join()
+        assert not any(
+            "waits" in text for text in [*rig.console.status()["warnings"], *status_parts(rig.service.status())]
+        )
+
+
+def test_a_command_for_another_rig_is_refused() -> None:
+    with running() as rig:
+        fields = wire.encode_document({"rig": "the one before", "speed_hz": 1.0})
+        reply = wire.decode_document(rig.listener.client.request(wire.command_key("speed"), fields))
+        assert reply["error"] == "speed was sent to another rig, which ran here before: connect again"
+        assert rig.console.status()["commands"] == 0
+
+
 @pytest.mark.parametrize("end_tick", [BLOCK - 1, 2 * BLOCK, 2**62])
 def test_a_device_that_reports_a_future_block_is_removed(end_tick: int) -> None:
     with running() as rig:
@@ -222,13 +293,14 @@ def test_devices_are_waited_for_only_in_lockstep() -> None:
 
 def test_lost_devices_are_removed_first_when_there_are_too_many() -> None:
     with running() as rig:
+        console = rig.console
         for n in range(64):
-            rig.console.join(f"device {n}")
+            console.join(f"device {n}")
         with pytest.raises(RefusedError, match="one of at most 64 devices"):
-            rig.console.join("one more")
+            console.join("one more")
         with pytest.raises(RefusedError, match="the end of the last block"):
-            rig.console.done(7, "device 5")
-        rig.console.join("one more")
+            console.done(7, "device 5")
+        console.join("one more")
         names = [row["name"] for row in rig.console.status()["devices"]]
         assert (len(names), names[-1]) == (64, "one more")
         assert "device 5" not in names

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from drivers.protection import Settings
-from drivers.protection.__main__ import parse
-from rig.base.errors import InputError
+from drivers.protection.__main__ import act, parse
+from drivers.protection.monitor import Action
+from rig.base.errors import InputError, RefusedError
 from tests.unit import protection_scenarios
 from tests.unit.protection_mutants import MUTANTS, Mutant
 from tests.unit.protection_scenarios import SCENARIOS, sound
@@ -27,6 +28,53 @@ def test_each_mutant_is_detected_by_its_scenario(mutant: Mutant) -> None:
 
 def test_each_scenario_detects_a_mutant() -> None:
     assert {mutant.told_by for mutant in MUTANTS} == set(SCENARIOS)
+
+
+class Machine:
+    """A rig that refuses what it is told to refuse, and records what it is asked."""
+
+    def __init__(self, *refused: str) -> None:
+        self.refused, self.asked = refused, list[str]()
+
+    def note(self, text: str, *, tags: list[str]) -> None:
+        self._take("note", tags[1])
+
+    def speed(self, hz: float) -> None:
+        self._take("speed", f"speed {hz:g}")
+
+    def stop(self) -> None:
+        self._take("stop", "stop")
+
+    def _take(self, command: str, words: str) -> None:
+        self.asked.append(words)
+        if command in self.refused:
+            raise RefusedError(f"{command} must be left out")
+
+
+ACTIONS = [Action(kind, "disk_x", 7, 350, 0.00035, 1100.0) for kind in ("danger", "trip", "not-ok")]
+
+
+@pytest.mark.parametrize(("trip", "asked"), [("speed 0", "speed 0"), ("stop", "stop")])
+def test_a_trip_is_reported_before_it_is_commanded(trip: Any, asked: str) -> None:
+    machine, lines = Machine(), list[str]()
+    act(machine, Settings(alert_um=500, danger_um=1000, trip=trip), ACTIONS, lines.append)
+    assert machine.asked == ["danger", "trip", "not-ok", asked]
+    assert lines == [str(action) for action in ACTIONS]
+
+
+@pytest.mark.parametrize("trip", ["speed 0", "stop"])
+def test_a_refused_trip_is_reported_and_the_monitor_continues(trip: Any) -> None:
+    machine, lines = Machine("speed", "stop"), list[str]()
+    act(machine, Settings(alert_um=500, danger_um=1000, trip=trip), ACTIONS, lines.append)
+    assert machine.asked[-1] == "trip-refused"
+    assert lines[-1] == f"0.000350 s  trip-refused  {trip.split()[0]} must be left out"
+
+
+def test_refused_notes_do_not_prevent_the_trip() -> None:
+    machine, lines = Machine("note"), list[str]()
+    act(machine, Settings(alert_um=500, danger_um=1000), ACTIONS, lines.append)
+    assert machine.asked[-1] == "speed 0"
+    assert lines[1] == "note refused: note must be left out"
 
 
 @pytest.mark.parametrize(

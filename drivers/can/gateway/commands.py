@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import secrets
 import threading
 import time
 from collections import Counter, deque
@@ -100,6 +101,8 @@ class Commands:
         self._acknowledge = acknowledge
         self._refuse_device = refuse_device
         self._timeout_s = timeout_s
+        self._secret = secrets.token_hex(16)
+        """Secret of all devices on this bus: only frames can end their blocks or remove them."""
         self._now = now
         self._guard = guard
         self._work = threading.Condition()
@@ -195,7 +198,8 @@ class Commands:
 
     def _send(self, item: _PendingCommand) -> None:
         command = item.command
-        request = wire.encode_document({"from": item.device if item.ordered else "CAN", **command.values})
+        secret = {"secret": self._secret} if isinstance(command, DeviceRequest) else {}
+        request = wire.encode_document({"from": item.device if item.ordered else "CAN", **secret, **command.values})
         timeout_s = _ORDER_TIMEOUT_S if item.ordered else self._timeout_s
         try:
             key = wire.command_key(command.kind.name.lower())

@@ -69,7 +69,7 @@ def run(
         return service
 
     paced = pace is Pace.REAL_TIME
-    serve(make, _words, _print_summary, serving=serving, bus=bus, paced=paced, wait=not paced)
+    serve(make, status_parts, _print_summary, serving=serving, bus=bus, paced=paced, wait=not paced)
 
 
 def _block_ticks(block_ms: float, simulation: Any) -> int:
@@ -89,12 +89,16 @@ def _clock(pace: Pace) -> Clock:
     return Lockstep() if pace is Pace.LOCKSTEP else FreeRun()
 
 
-def _words(status: dict[str, Any]) -> list[str]:
+def status_parts(status: dict[str, Any]) -> list[str]:
+    """Return the parts of a progress line."""
+    from rig.serve.devices import describe_waits
+
     end_s, spin_hz = status["end_s"], status["spin_hz"]
     end = "" if end_s is None else f" of {end_s:g}"
     spin = [] if spin_hz is None else [f"spin {spin_hz:.2f} Hz"]
+    waits = [text] if (text := describe_waits(status["devices"])) else []
     pace = f"x{status['real_time_factor']:.4f} real time"
-    return [f"{status['time_s']:7.2f}{end} s", *spin, pace, lateness_text(status)]
+    return [f"{status['time_s']:7.2f}{end} s", *waits, *spin, pace, lateness_text(status)]
 
 
 def _print_summary(summary: dict[str, Any]) -> None:

@@ -20,8 +20,17 @@ class NoReplyError(ConnectionError):
     """No reply to a request in time: no rig runs there, or it hangs."""
 
 
+class RigLostError(ConnectionError):
+    """The rig was killed or restarted, or the link to it is lost; a restarted rig is another rig."""
+
+
 class Server(Protocol):
     """The rig's side of a transport."""
+
+    @property
+    def identities(self) -> frozenset[str]:
+        """Identities of this rig, one of which each client sees as `Client.rig`."""
+        ...
 
     def publish(self, key: str, payload: bytes) -> None:
         """Send one payload to all subscribers. May be slow; must not be called from the simulation thread."""

@@ -31,6 +31,11 @@ class Fanout:
         self.warnings = warnings
         self._figures = figures
 
+    @property
+    def identities(self) -> frozenset[str]:
+        """Identities on all transports."""
+        return frozenset().union(*(server.identities for server in self._servers))
+
     def publish(self, key: str, payload: bytes) -> None:
         """Send one payload to all subscribers of all transports."""
         for server in self._servers:

@@ -45,6 +45,11 @@ class MemoryServer(Closing):
         self._announced = False
         self._closed = False
 
+    @property
+    def identities(self) -> frozenset[str]:
+        """Identity of this server."""
+        return frozenset({f"{id(self):x}"})
+
     def publish(self, key: str, payload: bytes) -> None:
         """Deliver one payload to all subscribers, in the order of their subscriptions."""
         with self._lock:
@@ -146,7 +151,7 @@ class MemoryClient(Closing):
 
     def __init__(self, server: MemoryServer) -> None:
         self._server = server
-        self.rig = f"{id(server):x}"
+        (self.rig,) = server.identities
 
     def subscribe(
         self,

@@ -125,6 +125,11 @@ class ZenohServer(Closing):
         self._replies: SimpleQueue[tuple[Any, str, bytes] | None] = SimpleQueue()
         self._session.drain(iter(self._replies.get, None), lambda late: _reply(*late), "replies")
 
+    @property
+    def identities(self) -> frozenset[str]:
+        """Identity of this rig's session."""
+        return frozenset({str(self._session.session.info.zid())})
+
     def publish(self, key: str, payload: bytes) -> None:
         """Send one payload to all subscribers, and keep it for recovery; on one thread only."""
         publisher = self._publishers.get(key) or self._declare(key)
