@@ -47,6 +47,7 @@ class NoteKind(IntEnum):
     ROWS_LOST = 9
     ON = 10
     REVERSE = 11
+    TRIP_REFUSED = 12
 
     @property
     def tag(self) -> str:

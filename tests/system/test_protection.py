@@ -56,11 +56,10 @@ def test_a_monitor_whose_trip_is_refused_reports_it_and_monitors_to_the_end(tran
             assert machine.event("device", timeout_s=60.0)["state"] == "joined"
             machine.advance(0.5)
             assert machine.lost == {}, "it still takes part"
-            if transport == "zenoh":
-                notes = [machine.event("note")["tags"][-1]]
-                while notes[-1] != "trip-refused":
-                    notes.append(machine.event("note")["tags"][-1])
-                assert "trip" in notes, "it is reported first"
+            notes = [machine.event("note")["tags"][-1]]
+            while notes[-1] != "trip-refused":
+                notes.append(machine.event("note")["tags"][-1])
+            assert "trip" in notes, "it is reported first"
             machine.stop()
             output, errors = device.communicate(timeout=60.0)
     assert (device.returncode, errors) == (0, "")

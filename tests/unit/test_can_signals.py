@@ -333,6 +333,7 @@ def test_kinds_of_notes_keep_their_numbers() -> None:
         "rows-lost",
         "on",
         "reverse",
+        "trip-refused",
     ]
     assert {kind.tag: int(kind) for kind in NoteKind} == {tag: number for number, tag in enumerate(tags, start=1)}
 
@@ -340,7 +341,7 @@ def test_kinds_of_notes_keep_their_numbers() -> None:
 @pytest.mark.parametrize(
     "raw",
     [
-        {"note": 0}, {"note": 15}, {"note": 2, "alarm": 1}, {"note": 5, "alarm": 12}, {"note": 2, "channel": 21},
+        {"note": 0}, {"note": 15}, {"note": 2, "alarm": 1}, {"note": 5, "alarm": 13}, {"note": 2, "channel": 21},
         {"note": 2, "channel": 255}, {"note": 2, "number": -2048, "exponent": 1},
     ],
 )  # fmt: skip

@@ -198,7 +198,7 @@ class Commands:
 
     def _send(self, item: _PendingCommand) -> None:
         command = item.command
-        secret = {"secret": self._secret} if isinstance(command, DeviceRequest) else {}
+        secret = {"secret": self._secret} if "device" in command.values else {}  # join, done, leave
         request = wire.encode_document({"from": item.device if item.ordered else "CAN", **secret, **command.values})
         timeout_s = _ORDER_TIMEOUT_S if item.ordered else self._timeout_s
         try:
