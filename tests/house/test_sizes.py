@@ -22,7 +22,7 @@ SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
     "drivers": 709,
-    "drivers/can": 4516,
+    "drivers/can": 4517,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
@@ -34,7 +34,7 @@ BUDGETS = {
     "recorder/output": 544,
     "recorder/viewer": 1893,
     "replays": 0,
-    "replays/campaigns": 2794,
+    "replays/campaigns": 2931,
     "replays/estimate": 337,
     "replays/player": 816,
     "replays/recordings": 10317,
@@ -45,7 +45,7 @@ BUDGETS = {
     "rig": 53,
     "rig/base": 921,
     "rig/channels": 2417,
-    "rig/cli": 5222,
+    "rig/cli": 5234,
     "rig/physics": 5456,
     "rig/run": 1821,
     "rig/serve": 2889,

@@ -8,6 +8,7 @@ import pytest
 
 from replays.campaigns.equipment.device import fill_placeholders
 from replays.campaigns.files.campaign import Campaign, campaign_path, find_shipped, load_campaign, read_title
+from replays.campaigns.files.expectation import ExpectEvent
 from replays.campaigns.files.line_numbers import number_lines
 from rig.base.errors import InputError
 from tests.commands import run_captured
@@ -19,6 +20,7 @@ TWO = (
 )
 OUTSIDE = 'device = { command = "python -m json.tool", joins = false, name = "out" }\n'
 PEAK = '[[expect]]\nsignal = "disk_x"\nmust = "<= 2 mm"\n'
+EVENT = '[[expect]]\nevent = "{}"\nwhere = {{ {} }}\nappears = false\n'
 
 
 def load(folder: Path, text: str) -> Campaign:
@@ -251,8 +253,128 @@ WRONG = {
         6,
         "must be with a unit, as corner is in Hz",
     ),
+    "misspelt field": (
+        HEAD + EVENT.format("hammer", "force = 100.0"),
+        5,
+        "expect.where.force must be a field of the event hammer, such as force_n",
+    ),
+    "text for a number": (HEAD + EVENT.format("hammer", 'force_n = "100"'), 5, "where.force_n must be a valid number"),
+    "value out of range": (HEAD + EVENT.format("hammer", "force_n = 1e4"), 5, "less than or equal to 1000"),
+    "true for a number": (HEAD + EVENT.format("speed", "speed_hz = true"), 5, "must be a valid number; received True"),
+    "not a number": (HEAD + EVENT.format("hammer", "force_n = nan"), 5, "must be a finite number"),
+    "no such direction": (HEAD + EVENT.format("hammer", 'direction = "z"'), 5, "where.direction must be x, y, -x, -y"),
+    "misspelt command": (
+        HEAD + EVENT.format("command", 'command = "sped"'),
+        5,
+        "one of the known names, such as speed",
+    ),
+    "command without an event": (HEAD + EVENT.format("command", 'command = "join"'), 5, "where.command must be"),
+    "field of another command": (
+        HEAD + EVENT.format("command", 'command = "speed", "request.force_n" = 1.0'),
+        5,
+        "where.request.force_n must be a field of the event command, such as request.speed_hz",
+    ),
+    "field in a table": (
+        HEAD + EVENT.format("command", 'command = "speed", request.speed_hz = "0"'),
+        5,
+        "where.request.speed_hz must be a valid number",
+    ),
+    "no such kind": (
+        HEAD + EVENT.format("fault", '"what.kind" = "stuk"'),
+        5,
+        "where.what.kind must be one of the known names, such as stuck",
+    ),
+    "number of another kind": (
+        HEAD + EVENT.format("fault", '"what.kind" = "gain", "what.rms_us" = 1.0'),
+        5,
+        "where.what.rms_us must be a field of the event fault, such as what.",
+    ),
+    "channel that is none": (HEAD + EVENT.format("fault", 'channels = "disk_z"'), 5, "a channel or a group, such as"),
+    "no such state": (HEAD + EVENT.format("device", 'state = "joind"'), 5, "must be 'joined', 'left' or 'lost'"),
+    "tags that are numbers": (HEAD + EVENT.format("note", "tags = 1"), 5, "where.tags must be a valid list"),
+    "text of an event without one": (HEAD + EVENT.format("hammer", "") + 'text = "x"\n', 7, "hammer has no text"),
+    "misspelt field in an order": (
+        HEAD + '[[expect]]\norder = [{ event = "note" },\n  { event = "note", where = { form = "dut" } }]\n',
+        5,
+        "expect.order.where.form must be a field of the event note, such as from",
+    ),
+    "misspelt field of an origin": (
+        HEAD + '[[expect]]\nevent = "note"\nmust = "<= 1 s"\nsince = { event = "note", where = { tag = "a" } }\n',
+        6,
+        "expect.since.where.tag must be a field of the event note, such as tags",
+    ),
+    "condition on no event": (
+        HEAD + '[[expect]]\nevent = "note"\nmust = "<= 1 s"\nsince = { at_s = 0.1, where = { tags = "a" } }\n',
+        6,
+        "expect.since.where must be left out without event",
+    ),
+    "origin of a number": (
+        HEAD + '[[expect]]\nevent = "note"\ntake = "count"\nmust = "== 1"\nsince = { at_s = 0.1 }\n',
+        7,
+        "expect.since must be left out where take is count",
+    ),
+    "origin behind the end": (
+        HEAD + '[[expect]]\nevent = "note"\nmust = "<= 1 s"\nsince = { at_s = 2.0 }\n',
+        6,
+        "expect.since.at_s must be within the case, which ends at 2 s",
+    ),
+    "window from the end": (HEAD + PEAK + "from_s = 2.0\n", 6, "expect.from_s must be within the case"),
+    "axis that nothing uses": (
+        HEAD + PEAK + '[matrix.device]\nvote = ["1oo2", "2oo2"]\n',
+        7,
+        "matrix.device.vote must be used somewhere as {vote}",
+    ),
+    "limit that nothing uses": (
+        HEAD + '[limits]\ndanger = "2 mm"\n' + PEAK,
+        4,
+        "limits.danger must be used somewhere as {danger}",
+    ),
+    "limits of the matrix that nothing uses": (
+        HEAD + '[matrix.limits]\ndanger = ["2 mm"]\n' + PEAK,
+        4,
+        "matrix.limits.danger must be used",
+    ),
+    "axis without faults": (HEAD + "[matrix]\nfault = []\n" + PEAK, 4, "matrix.fault must be a value of at least 1"),
+    "axis without scenes": (HEAD + "[matrix]\nscene = []\n" + PEAK, 4, "matrix.scene must be a value of at least 1"),
+    "no steps": (HEAD + "steps = []\n" + PEAK, 3, "steps must be a value of at least 1"),
+    "when of no values": (
+        HEAD + PEAK + 'when = { scene = [] }\n[matrix]\nscene = ["hammer", "stable-run"]\n',
+        6,
+        "expect.when.scene must be a value or a list of values",
+    ),
     "no such quantity": (HEAD + '[[expect]]\nscore = "gian"\nfile = "x.csv"\n', 4, "such as gain"),
 }
+
+
+RIGHT = (
+    ("hammer", "force_n = 100, direction = 'x'"), ("command", "command = 'stop', from = 'any'"),
+    ("command", "'request.kind' = 'gain', 'request.factor' = 2.0"), ("note", "tags = ['a', 'b'], text = 'any'"),
+    ("fault", "channel = 'probes', 'first_row.probes' = 0, what.kind = 'dropout'"), ("clear", "fault = 1, id = 1"),
+    ("device", "device = 'any', state = 'lost', patience_s = 1"), ("end", "reason = 'any'"), ("warning", "text = 'x'"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("event", "where"), RIGHT)
+def test_fields_that_events_have_are_accepted(event: str, where: str, tmp_path: Path) -> None:
+    (case,) = load(tmp_path, HEAD + EVENT.format(event, where)).cases
+    (expect,) = case.expects
+    assert isinstance(expect, ExpectEvent)
+    assert not [value for value in expect.where.values() if isinstance(value, dict)]
+
+
+def test_many_cases_need_a_confirmation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "x.campaign.toml"
+    speeds = '[matrix.set]\n"drive.speed_hz" = {}\nseed = {}\n'
+    file.write_text(HEAD + PEAK + speeds.format([3.0 + n / 10 for n in range(21)], list(range(50))), encoding="utf-8")
+    status, _, err = run_captured(capsys, "campaign", file)
+    assert status == 2
+    assert err == f"rig: {file}:6: matrix must be at most 1,000 cases, unless --yes is given; received 1050\n"
+    file.write_text(HEAD + PEAK, encoding="utf-8")
+    other = tmp_path / "y.campaign.toml"
+    for each in (file, other):
+        each.write_text(HEAD + PEAK + speeds.format([3.0], list(range(501))), encoding="utf-8")
+    status, _, err = run_captured(capsys, "campaign", file, other)
+    assert (status, err) == (2, "rig: --yes must be given for more than 1,000 cases; received 1002 cases\n")
 
 
 @pytest.mark.parametrize("name", WRONG)

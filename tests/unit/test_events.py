@@ -13,10 +13,13 @@ import rig
 from drivers.console import Console
 from recorder.reader import Recording
 from recorder.session import RecordingSession
+from replays.campaigns.files.event_fields import check_event
+from replays.campaigns.files.expectation import EventOf
 from replays.recordings.export import write_run
 from replays.recordings.validation import validate
 from rig.base import wire
 from rig.base.errors import InputError
+from rig.channels.table import default_table
 from rig.run.commands.table import COMMANDS, EVENT_KINDS, MECHANICAL
 from rig.run.scenes import parse_scene
 from rig.run.simulation import Simulation
@@ -49,6 +52,13 @@ def find_event_kinds() -> set[str]:
 
 def test_the_table_of_events_is_complete() -> None:
     assert set(COMMANDS) | find_event_kinds() == set(EVENT_KINDS)
+
+
+def check_fields(event: dict[str, Any]) -> None:
+    """Raise an error unless a campaign can select the event by all of its fields."""
+    where = {name: value for name, value in event.items() if name != "event" and value not in (None, {})}
+    selector = EventOf(event=event["event"], where=where)
+    check_event(selector, [*default_table().channels, *default_table().groups], field="event")
 
 
 def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:
@@ -89,6 +99,8 @@ def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:
     recording = Recording.open(tmp_path / "a.mcap")
     events = recording.events
     assert {event["event"] for event in events} == set(EVENT_KINDS)
+    for event in events:  # the checks of campaigns know every field
+        check_fields(event)
     cleared = [event for event in events if event["event"] == "clear"]
     assert [(event["id"], event["fault"]) for event in cleared] == [(4, [4]), (1, [1]), (2, [2]), (3, [3])]
     assert recording.doubts == ()

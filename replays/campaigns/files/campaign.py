@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import itertools
+import json
+import math
 import re
 import shlex
 import tomllib
@@ -18,7 +20,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat
 from replays.campaigns.equipment.bench import BenchSettings, Pace, Waits
 from replays.campaigns.equipment.device import CAN_PLACES, PLACEHOLDER, PLACES, check_program, fill_placeholders
 from replays.campaigns.files.case_results import Time, Units
-from replays.campaigns.files.expectation import KINDS, Expect, find_events
+from replays.campaigns.files.event_fields import check_event
+from replays.campaigns.files.expectation import KINDS, Expect, find_selectors
 from replays.campaigns.files.line_numbers import find_line, number_lines
 from replays.campaigns.measurement import split_quantity
 from rig.base.checks import Written, build_read_error, check, open_file, parse_toml
@@ -32,7 +35,10 @@ from rig.run.scenes import Scene, load_scene
 SUFFIX = ".campaign.toml"
 FOLDER = Path(__file__).parents[1]
 """Folder of the shipped campaigns."""
-_MAX_CASES = 10_000
+MAX_CASES = 10_000
+"""Largest number of cases in a file."""
+MAX_UNCONFIRMED_CASES = 1000
+"""Largest number of cases that run without a confirmation."""
 _BLOCK_MS = (1.0, 1000.0)
 Line = Annotated[str, Field(min_length=1, max_length=1000)]
 
@@ -66,9 +72,9 @@ class _Device(Written):
 
 
 class _Matrix(Written):
-    scene: list[str] = Field(default=[])
+    scene: list[str] = Field(default=[], min_length=1)
     set: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default={})
-    fault: list[dict[str, Any]] = Field(default=[])
+    fault: list[dict[str, Any]] = Field(default=[], min_length=1)
     limits: dict[str, Annotated[list[Quantity], Field(min_length=1)]] = Field(default={})
     device: dict[str, Annotated[list[str | int | float], Field(min_length=1)]] = Field(default={})
 
@@ -85,10 +91,10 @@ class _File(Written):
     can: bool = False
     wait: Waits = Waits()
     device: _Device | None = None
-    devices: list[_Device] = Field(default=[])
+    devices: list[_Device] = Field(default=[], min_length=1)
     limits: dict[str, Quantity] = Field(default={})
     matrix: _Matrix = _Matrix()
-    steps: list[dict[str, Any]] = Field(default=[])
+    steps: list[dict[str, Any]] = Field(default=[], min_length=1)
     expect: Annotated[list[dict[str, Any]], Field(min_length=1)]
 
 
@@ -171,13 +177,16 @@ def campaign_path(name_or_path: str) -> Path:
     return shipped.get(name_or_path, path)
 
 
-def load_campaign(path: Path, device: str | None = None, limits: Sequence[str] = ()) -> Campaign:
+def load_campaign(
+    path: Path, device: str | None = None, limits: Sequence[str] = (), *, max_cases: int = MAX_CASES
+) -> Campaign:
     """Read and check a campaign file.
 
     Args:
         path: The file.
         device: Command line that replaces that of the file's device.
         limits: Limits that replace those of the file and of its matrix, such as "danger=500 um".
+        max_cases: Largest number of cases.
 
     Raises:
         InputError: For the first error, with the file and line.
@@ -198,17 +207,19 @@ def load_campaign(path: Path, device: str | None = None, limits: Sequence[str] =
         raise InputError(f"{where}: the text", "TOML", Words(problem)) from None
     with _add_location(path, text):
         file = check(_File, document, field="")
+        written = file
         if device is not None:
             if file.device is None:
                 raise InputError("--device", "left out, as the campaign has no [device]", device)
             own = file.device.model_copy(update={"command": device, "folder": str(Path.cwd())})
             file = file.model_copy(update={"device": own})
-        cases = tuple(_cases(path, _replace_limits(file, limits)))
+        cases = tuple(_cases(path, _replace_limits(file, limits), max_cases))
         ids: set[str] = set()
         for case in cases:
             if case.id in ids:
                 raise InputError("matrix", "cases with different names (give the faults an id)", case.id)
             ids.add(case.id)
+        _check_use(written)
     return Campaign(file.title, file.about, cases)
 
 
@@ -237,13 +248,24 @@ def _add_location(path: Path, text: str) -> Iterator[None]:
         raise InputError(f"{path}:{line}: {field}", must, received) from None
 
 
-def _cases(path: Path, file: _File) -> Iterator[Case]:
+def _check_use(file: _File) -> None:
+    """Raise an error for a limit, or an axis of the matrix, that nothing uses."""
+    commands = [each.command for each in (file.device, *file.devices) if each is not None]
+    places = [file.steps, file.expect, file.matrix.fault, commands]
+    used = {match[1] for match in PLACEHOLDER.finditer(json.dumps(places, default=str))}
+    used |= {axis for each in file.expect if isinstance(when := each.get("when"), dict) for axis in when}
+    matrix = file.matrix
+    for table, names in {"limits": file.limits, "matrix.limits": matrix.limits, "matrix.device": matrix.device}.items():
+        for name in names:
+            if name not in used:
+                raise InputError(f"{table}.{name}", f"used somewhere as {{{name}}}", Words("a name that nothing uses"))
+
+
+def _cases(path: Path, file: _File, max_cases: int) -> Iterator[Case]:
     axes = list(_axes(file))
-    count = 1
-    for _, values in axes:
-        count *= len(values)
-    if count > _MAX_CASES:
-        raise InputError("matrix", f"at most {_MAX_CASES} cases", count)
+    if (count := math.prod(len(values) for _, values in axes)) > max_cases:
+        must = f"at most {max_cases:,} cases{', unless --yes is given' if max_cases < MAX_CASES else ''}"
+        raise InputError("matrix", must, count)
     scenes: dict[str, Scene] = {}
     stem = path.name.removesuffix(SUFFIX)
     for chosen in itertools.product(*(values for _, values in axes)):
@@ -313,9 +335,11 @@ def _case(
     axes = {axis.rpartition(" ")[2]: [label for label, _ in each] for axis, each in _axes(file)}
     devices = tuple(_devices(file, places, path))
     sources = {"note" if step.command is None else "command" for step in steps} | {"command" for _ in own}
-    expects = []
+    expects, channels = [], [*scene.table.channels, *scene.table.groups]
     for n, one in enumerate(file.expect):
         expect = _expect(one, f"expect.{n}", places, units_by_table, duration_s)
+        for at, selector in find_selectors(expect):
+            check_event(selector, channels, field=f"expect.{n}{at}")
         _check_when(expect, f"expect.{n}.when", axes)
         _check_pace(expect, f"expect.{n}", devices if file.pace == "lockstep" else (), sources)
         if all(axis_labels[axis] in labels for axis, labels in _when(expect)):
@@ -442,8 +466,9 @@ def _expect(
     expect = check(KINDS[kinds[0]], _fill_placeholders(dict(entry), places, field), field=field)
     expect.check(units_by_table, where=field)
     times = {name: getattr(expect, name, None) for name in ("from_s", "at_s", "to_s")}
+    times["since.at_s"] = getattr(getattr(expect, "since", None), "at_s", None)
     for name, time_s in times.items():
-        if time_s is not None and time_s > duration_s:
+        if time_s is not None and (time_s > duration_s or (time_s == duration_s and name != "to_s")):
             raise InputError(f"{field}.{name}", f"within the case, which ends at {duration_s:g} s", time_s)
     if times["to_s"] is not None and not times["from_s"] < times["to_s"]:
         raise InputError(f"{field}.to_s", f"after from_s, {times['from_s']:g} s", times["to_s"])
@@ -462,6 +487,8 @@ def _check_when(expect: Expect, field: str, axes: Mapping[str, list[str]]) -> No
     for axis, labels in _when(expect):
         if axis not in axes:
             raise UnknownNameError(f"{field}.{axis}", "an axis of the matrix", axis, axes)
+        if not labels:
+            raise InputError(f"{field}.{axis}", "a value or a list of values", labels)
         for label in labels:
             if label not in axes[axis]:
                 raise UnknownNameError(f"{field}.{axis}", f"a value of {axis} in the matrix", label, axes[axis])
@@ -476,7 +503,7 @@ def _check_pace(expect: Expect, field: str, devices: tuple[_Device, ...], source
     outside = [device.name for device in devices if not device.joins]
     sends = any(device.commands for device in devices if not device.joins)
     known = {"campaign", *(device.name for device in devices if device.joins)}
-    for event in find_events(expect) if outside else ():
+    for _, event in find_selectors(expect) if outside else ():
         sender = event.where.get("from")
         is_device_event = event.event in ("note", "command", *COMMANDS)
         is_from_step = ("note" if event.event == "note" else "command") in sources

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from replays.campaigns.files.case_results import CaseRecording, Expected, Time, Units, convert_unit, parse_limit
 from replays.campaigns.files.scored import ExpectScore
@@ -27,6 +27,18 @@ if TYPE_CHECKING:
 else:
     EventName = Literal[*EVENT_KINDS, *REPLAY_COMMANDS]
     """Events of a rig or a replay."""
+
+
+def _flatten_tables(where: dict[str, Any]) -> dict[str, Any]:
+    """Return a table with dotted names in place of tables in it, as `request.speed_hz = 0.0` is written in TOML."""
+    found = {}
+    for name, value in where.items():
+        inner = _flatten_tables(value) if isinstance(value, dict) else {}
+        found |= {f"{name}.{key}": each for key, each in inner.items()} if inner else {name: value}
+    return found
+
+
+Where = Annotated[dict[str, Any], AfterValidator(_flatten_tables)]
 
 
 class _SignalFields(Written):
@@ -69,7 +81,7 @@ class EventOf(Written):
     """An event, selected by its name and its fields: `where` compares fields and searches lists."""
 
     event: EventName
-    where: dict[str, Any] = Field(default={})
+    where: Where = Field(default={})
     text: str = ""
 
     def __str__(self) -> str:
@@ -97,7 +109,7 @@ class Since(_SignalFields):
 
     at_s: Time | None = None
     event: EventName | Literal[""] = ""
-    where: dict[str, Any] = Field(default={})
+    where: Where = Field(default={})
     text: str = ""
     beyond: str = ""
 
@@ -110,17 +122,25 @@ class Since(_SignalFields):
         origins = [name for name in ("at_s", "event", "signal") if getattr(self, name) not in (None, "", [])]
         if len(origins) != 1:
             raise InputError(where, "given by one of at_s, event and signal", Words(" and ".join(origins) or "none"))
+        owners = {"where": "event", "text": "event", "beyond": "signal", "truth": "signal"}
+        for name, owner in owners.items():
+            if getattr(self, name) and owner not in origins:
+                raise InputError(f"{where}.{name}", f"left out without {owner}", getattr(self, name))
         if self.signal:
             unit = self.unit(units, where=where)
             quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))
+
+    @property
+    def of(self) -> EventOf:
+        """Selector of the event."""
+        return EventOf(event=self.event, where=self.where, text=self.text)
 
     def time_s(self, recording: CaseRecording, units: Units, *, from_s: float) -> float:
         """Return the time of the origin, from the start of the case [s]; NaN if it does not occur."""
         if self.at_s is not None:
             return self.at_s
         if self.event:
-            event = EventOf(event=self.event, where=self.where, text=self.text)
-            return next((each for each in event.times_s(recording) if each >= from_s), math.nan)
+            return next((each for each in self.of.times_s(recording) if each >= from_s), math.nan)
         times_s, values = self.values(recording)
         level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="")
         rows = np.flatnonzero((np.abs(values) > level) & (times_s >= from_s - 1e-9))
@@ -235,7 +255,7 @@ class ExpectEvent(_Within):
     """An event that must occur, must not occur, or must occur at a certain time."""
 
     event: EventName
-    where: dict[str, Any] = Field(default={})
+    where: Where = Field(default={})
     text: str = ""
     appears: bool = True
     take: Literal["time", "count"] = "time"
@@ -250,9 +270,10 @@ class ExpectEvent(_Within):
         """
         if self.since is not None:
             self.since.check(units, where=f"{where}.since")
+            if not self.must or self.take == "count":
+                must = "left out without must" if not self.must else "left out where take is count"
+                raise InputError(f"{where}.since", must, Words("given"))
         if not self.must:
-            if self.since is not None:
-                raise InputError(f"{where}.since", "left out without must", Words("given"))
             return Must("==" if not self.appears else ">=", 0.0 if not self.appears else 1.0, "1")
         if not self.appears:
             raise InputError(f"{where}.appears", "left out with must", False)
@@ -349,13 +370,15 @@ def _list_times(times_s: list[float]) -> str:
     return f"{', '.join(f'{each:g}' for each in times_s[:5])}{', ...' if len(times_s) > 5 else ''} s"
 
 
-def find_events(expect: Expect) -> Iterator[EventOf]:
-    """Yield all events of an expectation: expected, not expected, and the origin of a time."""
+def find_selectors(expect: Expect) -> Iterator[tuple[str, EventOf]]:
+    """Yield all events of an expectation, each with its field: expected, not expected, and the origin of a time."""
+    if isinstance(expect, ExpectOrder):
+        yield from ((f".order.{n}", each) for n, each in enumerate(expect.order))
+    if isinstance(expect, ExpectEvent):
+        yield "", expect.of
     since = None if isinstance(expect, ExpectOrder | ExpectScore) else expect.since
-    yield from expect.order if isinstance(expect, ExpectOrder) else ()
-    yield from [expect.of] if isinstance(expect, ExpectEvent) else ()
     if since is not None and since.event:
-        yield EventOf(event=since.event, where=since.where, text=since.text)
+        yield ".since", since.of
 
 
 def _name(names: tuple[str, ...]) -> str:

@@ -48,7 +48,9 @@ def number_lines(text: str) -> dict[str, int]:
 
 
 def find_line(field: str, lines: Mapping[str, int]) -> int | None:
-    """Return the line of a field or of the innermost enclosing table; None if there is none."""
+    """Return the line of a field, of its first part, or of the innermost enclosing table; None if there is none."""
+    if (parts := [line for name, line in lines.items() if name.startswith(f"{field}.")]) and field not in lines:
+        return min(parts)
     while field not in lines and "." in field:
         field = field.rpartition(".")[0]
     return lines.get(field)

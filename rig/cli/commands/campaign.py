@@ -57,6 +57,7 @@ def campaign(
         list[str] | None,
         typer.Option(metavar="NAME=TEXT", help="Identity on the sheet: name, serial, firmware, operator; repeatable"),
     ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Run more than 1,000 cases")] = False,
     url: Annotated[
         str | None, typer.Option(metavar="URL", help="Use the rig at this URL; skip cases that it cannot run")
     ] = None,
@@ -90,7 +91,7 @@ def campaign(
         parse_identity(identity or [])
         for file in sheet:
             check_sheet(file)
-    files = _check_files(files, against, replay, device, limit or ())
+    files = _check_files(files, against, replay, device, limit or (), yes=yes)
     plugin_options = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
     plugin_options["--rig-device"] = device
     options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
@@ -114,25 +115,41 @@ def _list() -> None:
 
 
 def _check_files(
-    files: list[str], against: Path | None, replay: Path | None, device: str | None, limits: Sequence[str]
+    files: list[str],
+    against: Path | None,
+    replay: Path | None,
+    device: str | None,
+    limits: Sequence[str],
+    *,
+    yes: bool,
 ) -> list[str]:
     """Return the paths of the files; raise an error for wrong files before anything runs."""
-    from replays.campaigns.files.campaign import SUFFIX, campaign_path, load_campaign
+    from replays.campaigns.files.campaign import (
+        MAX_CASES,
+        MAX_UNCONFIRMED_CASES,
+        SUFFIX,
+        campaign_path,
+        load_campaign,
+    )  # fmt: skip
     from replays.campaigns.reporting.results import load_results
 
-    paths = []
+    paths, count = [], 0
     for file in files:
         name, colons, case = file.partition("::")
         name = str(campaign_path(name))
         paths.append(f"{name}{colons}{case}")
         if name.endswith(SUFFIX):
-            known = [each.id for each in load_campaign(Path(name), device, limits).cases]
+            max_cases = MAX_CASES if yes or colons else MAX_UNCONFIRMED_CASES
+            known = [each.id for each in load_campaign(Path(name), device, limits, max_cases=max_cases).cases]
             if colons and case not in known:
                 raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
+            count += 1 if colons else len(known)
         elif not Path(name).exists():
             raise InputError("FILE", f"a *{SUFFIX} file, or tests of pytest, that exists", name)
         elif Path(name).is_file() and not name.endswith(".py"):
             raise InputError("FILE", f"a file that ends in {SUFFIX} or .py, or a folder", name)
+    if count > MAX_UNCONFIRMED_CASES and not yes:
+        raise InputError("--yes", f"given for more than {MAX_UNCONFIRMED_CASES:,} cases", Words(f"{count} cases"))
     if against is not None:
         load_results(against)
     if replay is not None:

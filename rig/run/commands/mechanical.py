@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, FiniteFloat, field_validator
+from pydantic import AfterValidator, Field, FiniteFloat
 
 from rig.base.errors import InputError, Words
 from rig.run.commands.command import CanField, CanFrame, Quantity, Run, SceneCommand
@@ -28,6 +28,13 @@ _SPEED = Quantity(
 )  # fmt: skip
 
 
+def _check_direction(direction: str | float) -> str | float:
+    is_valid = direction in _DIRECTIONS if isinstance(direction, str) else -360.0 <= direction <= 360.0
+    if not is_valid:
+        raise ValueError(f"{', '.join(_DIRECTIONS)}, or an angle from -360 to 360 degrees")
+    return direction
+
+
 class HammerCommand(SceneCommand):
     """An impact of the pendulum hammer on the disk: a half-sine pulse."""
 
@@ -38,16 +45,8 @@ class HammerCommand(SceneCommand):
     """Peak force [N]."""
     duration_ms: Annotated[FiniteFloat, Field(ge=0.5, le=50.0), _DURATION] = 5.0
     """Length of the pulse [ms]; the paper does not give it."""
-    direction: Annotated[str | float, _DIRECTION] = "x"
+    direction: Annotated[str | float, _DIRECTION, AfterValidator(_check_direction)] = "x"
     """Along x (EAST), y (up), or at an angle from x toward y [degrees]."""
-
-    @field_validator("direction")
-    @classmethod
-    def _check_direction(cls, direction: str | float) -> str | float:
-        is_valid = direction in _DIRECTIONS if isinstance(direction, str) else -360.0 <= direction <= 360.0
-        if not is_valid:
-            raise ValueError(f"{', '.join(_DIRECTIONS)}, or an angle from -360 to 360 degrees")
-        return direction
 
     @property
     def cosines(self) -> tuple[float, float]:
