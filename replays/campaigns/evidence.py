@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 import shutil
@@ -52,6 +53,9 @@ class Trial:
         measurements: Judged values, in order.
         kept: Files of the evidence.
         floor_ms: Median and maximum round-trip time of a rig in real time [ms].
+        file: File of the test, for its digest.
+        keeps_all: Whether the evidence of a test that passes is kept too.
+        digests: SHA-256 of the test's file, the programs of its devices, and its recording, by name.
     """
 
     id: str
@@ -69,6 +73,9 @@ class Trial:
     kept: list[Path] = field(default_factory=list)
     troubles: list[str] = field(default_factory=list)
     floor_ms: tuple[float, float] | None = None
+    file: Path | None = None
+    keeps_all: bool = False
+    digests: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._folder_entry = self.folder.lstat()
@@ -179,7 +186,13 @@ class Trial:
                     self.recording = self.record.stop()
 
     def _clean_up(self, failed: bool) -> None:
-        if failed:
+        for path in (self.file, *(file for device in self.devices for file in device.program_files)):
+            if path is not None:
+                with contextlib.suppress(OSError):  # removed during the test
+                    self.digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        if self.record is not None and self.record.sha256:
+            self.digests[f"recording of {self.id}"] = self.record.sha256
+        if failed or self.keeps_all:
             self._keep_evidence()
         for folder in (self.folder, *([self.records] if not failed or self.evidence is not None else ())):
             shutil.rmtree(folder, ignore_errors=True)
@@ -235,7 +248,8 @@ class Trial:
         from_s, to_s = max(span[0], about - EVENT_MARGIN_S), min(span[1] + 1e-3, about + EVENT_MARGIN_S)
         clip, picture = folder / "event.mcap", folder / "event.png"
         cut(recording, clip, from_s=from_s, to_s=to_s, force=True)
-        draw(Recording.open(clip), picture, failed, origin_s=self.origin_s, about_s=about)
+        judged = failed or [each for each in self.measurements if each.channels or each.at_s is not None]
+        draw(Recording.open(clip), picture, judged, origin_s=self.origin_s, about_s=about)
         return [clip, picture]
 
     def document(self) -> dict[str, Any]:
@@ -247,6 +261,7 @@ class Trial:
             "bench": None if self.settings is None else self.settings.document(),
             "resolution": self.resolution,
             "troubles": self.troubles,
+            "digests": self.digests,
             "floor_ms": None if self.floor_ms is None else [round(each, 3) for each in self.floor_ms],
         }
 

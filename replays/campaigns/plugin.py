@@ -185,7 +185,9 @@ def _get_trial(item: pytest.Item) -> Trial:
     options = item.config.option
     replay = None if options.rig_replay is None else Path(options.rig_replay).absolute()
     evidence = None if options.rig_results is None else Path(options.rig_results).absolute() / "evidence"
-    return Trial(item.nodeid, evidence, Target(options.rig_url, replay))
+    return Trial(
+        item.nodeid, evidence, Target(options.rig_url, replay), file=item.path, keeps_all=bool(options.rig_sheet)
+    )
 
 
 @pytest.fixture

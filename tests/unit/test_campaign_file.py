@@ -554,7 +554,9 @@ def test_a_device_outside_lockstep_may_be_judged_in_real_time_and_by_its_file(tm
     ],
 )
 def test_two_braces_are_one_brace_of_the_text(text: str, command: str, tmp_path: Path) -> None:
-    matrix = '[matrix.device]\nhow = ["{url} x"]\nnumber = [3]\n'
+    values = {"how": '["{url} x"]', "number": "[3]"}
+    used = [f"{name} = {value}\n" for name, value in values.items() if f"{{{name}}}" in text]
+    matrix = f"[matrix.device]\n{''.join(used)}"
     device = f"[device]\ncommand = 'python -m json.tool {text}'\n"
     (case,) = load(tmp_path, HEAD + device + matrix + PEAK).cases
     (found,) = case.devices

@@ -54,6 +54,10 @@ class Device:
         words = [fill_placeholders(word, places, "command") for word in words]
         check_program(words, where, field="command")
         self.name, self.log, self.folder, self.may_end, self.bench = name, log, files, may_end, bench
+        program = shutil.which(words[0], path=str(Path(sys.executable).parent)) or shutil.which(words[0])
+        files_named = (where / word for word in words[:3])
+        self.program_files = [file for file in (*files_named, Path(program or words[0])) if file.is_file()]
+        """Program and script of the command line."""
         self.joins = True
         """Whether the rig waits for it in lockstep."""
         self.is_ended_by_test = self.was_lost = self.has_ended_early = False

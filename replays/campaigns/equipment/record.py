@@ -138,6 +138,11 @@ class Record:
         if wrong:
             raise ReplacedRecordingError(f"the recording was replaced or altered during the test: {wrong}")
 
+    @property
+    def sha256(self) -> str:
+        """Digest of the recording; empty while it is being written."""
+        return "" if self._summary is None else self._summary.sha256
+
     def wait(self) -> None:
         """Wait until the recording has ended with the rig's run."""
         self._thread.join(_END_S)
