@@ -187,6 +187,7 @@ def png(figure: Figure, *, dpi: int = DPI, source: str = "") -> bytes:
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
+    _disable_mathtext(figure)
     about = PngInfo()
     if source:
         about.add_text("Source", source)
@@ -196,6 +197,25 @@ def png(figure: Figure, *, dpi: int = DPI, source: str = "") -> bytes:
     with Image.open(buffer) as image:
         _apply_palette(image.convert("RGB")).save(small, format="png", optimize=True, pnginfo=about)
     return small.getvalue()
+
+
+def _disable_mathtext(figure: Figure) -> None:
+    """Draw all texts as they are, as names and notes from outside may contain dollar signs; numbers at ticks are kept.
+
+    Args:
+        figure: The figure, complete.
+    """
+    from matplotlib.text import Text
+    from matplotlib.ticker import LogFormatter
+
+    numbers = set()
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if isinstance(axis.get_major_formatter(), LogFormatter):  # powers of ten
+                numbers.update(map(id, [*axis.get_ticklabels(), *axis.get_ticklabels(minor=True)]))
+    for text in figure.findobj(Text):
+        if id(text) not in numbers and isinstance(text, Text):
+            text.set_parse_math(False)
 
 
 def _apply_palette(image: Image) -> Image:
@@ -236,6 +256,7 @@ def _nearest(colours: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 @house_style()
 def _svg(figure: Figure, source: str) -> bytes:
+    _disable_mathtext(figure)
     buffer = io.BytesIO()
     # Without a date and with fixed identifiers, equal data give an equal file.
     figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None, "Source": source or None})

@@ -5,13 +5,14 @@ from __future__ import annotations
 import errno
 import io
 import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from replays.report.canvas import DPI, WIDTH, check_suffix, draw_signals, house_style, new_figure, png, save
+from replays.report.canvas import DPI, WIDTH, add_legend, check_suffix, draw_signals, house_style, new_figure, png, save
 from rig.base.errors import DiskError, InputError
 
 if TYPE_CHECKING:
@@ -34,6 +35,24 @@ def test_same_drawing_gives_same_bytes(tmp_path: Path, suffix: str, head: bytes)
     assert files[0].read_bytes() == files[1].read_bytes()
     assert files[0].read_bytes().startswith(head)
     assert b"dc:date" not in files[0].read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+def test_texts_from_outside_are_drawn_as_they_are_and_powers_of_ten_as_powers(tmp_path: Path, suffix: str) -> None:
+    outside = r"$\frac{$ and $x$"
+    figure = new_figure(4.0, outside)
+    axes, named = figure.subplots(2)
+    axes.loglog([1.0, 1e4], [1.0, 1e4], label=outside)
+    axes.set(title=outside, xlabel=outside)
+    axes.text(1.0, 1.0, outside)
+    axes.annotate(outside, (1.0, 1.0))
+    named.set_yticks([0.0, 1.0], ["a", outside])
+    add_legend(figure)
+    (file,) = save(figure, tmp_path / f"picture{suffix}")
+    if suffix == ".svg":
+        drawn = re.sub(r"<!--.*?-->", "", file.read_text(encoding="utf-8"), flags=re.DOTALL)
+        assert drawn.count(rf">{outside}</text>") == 7
+        assert "mathdefault" not in drawn
 
 
 def test_pictures_are_as_wide_as_all_with_a_palette(tmp_path: Path) -> None:
