@@ -384,3 +384,26 @@ def test_invalid_results_are_reported(tmp_path: Path) -> None:
         load_results(tmp_path)
     with pytest.raises(InputError, match="a file that can be read"):
         load_results(tmp_path / "nowhere")
+    for place, value, field in (
+        (["cases", 0, "measurements", 0, "margin"], "0.4", r"cases\.0\.measurements\.0\.margin"),
+        (["cases", 0, "outcome"], "great", r"cases\.0\.outcome"),
+        (["cases", 0, "id"], None, r"cases\.0\.id"), (["cases"], {}, "cases"), (["wall"], [], "wall"),
+    ):  # fmt: skip
+        altered: Any = results(good=0.4)
+        holder = altered
+        for key in place[:-1]:
+            holder = holder[key]
+        holder[place[-1]] = value
+        file.write_text(json.dumps(altered), encoding="utf-8")
+        with pytest.raises(InputError, match=field):
+            load_results(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["results.json", "junit.xml", "index.html", "evidence/of_mine.txt"])
+def test_a_folder_with_files_of_others_is_left_as_it_is(name: str, tmp_path: Path) -> None:
+    file = tmp_path / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("{}", encoding="utf-8")
+    with pytest.raises(InputError, match=f"--output must be a folder without {name.partition('/')[0]}"):
+        Results(tmp_path, None, cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None))))
+    assert file.read_text(encoding="utf-8") == "{}"

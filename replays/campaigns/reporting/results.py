@@ -12,12 +12,12 @@ import shutil
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from replays.campaigns.equipment.cleanup import find_containment
 from replays.report import junit, write_report
 from replays.studies.common import provenance
-from rig.base.checks import build_read_error, open_file, read_json
+from rig.base.checks import StrictModel, build_read_error, check, open_file, read_json
 from rig.base.errors import DiskError, InputError, whole_file
 from rig.base.text import printable, replace_nonfinite
 
@@ -33,6 +33,29 @@ _JUNIT: dict[str, junit.Outcome] = {
 }  # fmt: skip
 _MAX_REASON_LENGTH = 2000
 _UNFINISHED = "the run ended before this case was finished"
+
+
+class _EarlierMeasurement(StrictModel, extra="ignore"):
+    name: str
+    unit: str
+    margin: float | None
+
+
+class _EarlierCase(StrictModel, extra="ignore"):
+    id: str
+    outcome: Literal["failed", "error", "interrupted", "inconclusive", "skipped", "passed"]
+    measurements: list[_EarlierMeasurement]
+
+
+class _EarlierWall(StrictModel, extra="ignore"):
+    begun: str
+
+
+class _EarlierResults(StrictModel, extra="ignore"):
+    """What is read of the results of an earlier campaign."""
+
+    cases: list[_EarlierCase]
+    wall: _EarlierWall
 
 
 class Results:
@@ -52,8 +75,7 @@ class Results:
         self._lock = _lock_folder(folder)
         self._folder, self._config = folder, config
         self._earlier = None if against is None else load_results(against)
-        if (folder / "results.json").is_file():  # evidence of the results that are about to be overwritten
-            shutil.rmtree(folder / "evidence", ignore_errors=True)
+        _remove_evidence(folder)
         self._cases: dict[str, dict[str, Any]] = {}
         self._planned: dict[str, None] = {}
         self._begun_s = time.time()
@@ -149,6 +171,24 @@ class Results:
         return shlex.join(["rig", "campaign", f"{file}{colons}{rest}", *options])
 
 
+def _remove_evidence(folder: Path) -> None:
+    """Remove the evidence of an earlier campaign, whose results will be overwritten.
+
+    Raises:
+        InputError: If the folder holds files of these names that are not of a campaign.
+    """
+    files = [name for name in ("results.json", "junit.xml", "index.html", "evidence") if os.path.lexists(folder / name)]
+    if not files:
+        return
+    try:
+        load_results(folder)
+    except InputError:
+        must = f"a folder without {files[0]}, or one with the results of an earlier campaign"
+        raise InputError("--output", must, str(folder)) from None
+    if not (folder / "evidence").is_symlink():
+        shutil.rmtree(folder / "evidence", ignore_errors=True)
+
+
 def _lock_folder(folder: Path) -> int:
     """Create a folder if necessary and lock it; return the handle that holds the lock."""
     import fcntl
@@ -201,12 +241,9 @@ def load_results(folder: Path) -> dict[str, Any]:
             document = read_json(file.read(), field=str(path))
     except OSError as error:
         raise build_read_error(path, error) from None
-    cases = document.get("cases")
-    good = isinstance(cases, list) and all(
-        isinstance(case, dict) and {"id", "outcome", "measurements"} <= set(case) for case in cases
-    )
-    if document.get("format") != FORMAT or not good:
+    if document.get("format") != FORMAT:
         raise InputError(str(path), "campaign results written by this version of rig", document.get("format"))
+    check(_EarlierResults, document, field=str(path))
     return document
 
 
