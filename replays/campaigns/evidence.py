@@ -262,6 +262,7 @@ class Trial:
             "resolution": self.resolution,
             "troubles": self.troubles,
             "digests": self.digests,
+            "late_blocks": 0 if self.bench is None else self.bench.late,
             "floor_ms": None if self.floor_ms is None else [round(each, 3) for each in self.floor_ms],
         }
 

@@ -457,6 +457,14 @@ def test_shipped_campaigns_are_listed_by_name_and_load(capsys: pytest.CaptureFix
         campaign_path("hamer")
 
 
+def test_the_cases_are_listed_with_their_number(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run_captured(capsys, "campaign", "hammer", "recorder-acceptance", "--list")
+    assert (status, err) == (0, "")
+    assert "hammer.campaign.toml::speed_hz=5.2  0.6 s\nhammer.campaign.toml::speed_hz=6.2  0.6 s\n" in out
+    assert "test_recorder_acceptance.py: tests of pytest" in " ".join(out.split())
+    assert "\n2 cases, about " in out
+
+
 MATRIX = """
 title = "T"
 about = "A device with two votes, sound and with a fault"

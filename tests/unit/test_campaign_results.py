@@ -249,7 +249,7 @@ def results(**margins: float) -> dict[str, Any]:
         })  # fmt: skip
     cases.append({**cases[0], "id": "x.py::skipped", "outcome": "skipped", "reason": "no bus", "measurements": []})
     cases.append({**cases[0], "id": "x.py::broken", "outcome": "error", "reason": "no rig", "measurements": []})
-    wall = {case["id"]: {"duration_s": 1.25, "floor_ms": [0.3, 0.9]} for case in cases}
+    wall = {case["id"]: {"duration_s": 1.25, "floor_ms": [0.3, 0.9], "late_blocks": 3} for case in cases}
     return {
         "format": 1, "titles": ["T"],
         "counts": {"failed": 1, "error": 1, "interrupted": 0, "inconclusive": 0, "skipped": 1, "passed": 1},
@@ -332,7 +332,7 @@ def test_the_page_lists_failures_first_then_changes(tmp_path: Path) -> None:
         "1 failed, 1 error, 1 skipped, 1 passed.", "</a>: no rig</li>", "failed: x.campaign.toml::bad</h2>",
         "it is 1.25 mm", "<img",
         "rig campaign x.campaign.toml::bad", "Comparison with the earlier campaign</h2>",
-        "Measurements</h2>", "median 0.3 ms",
+        "Measurements</h2>", "median 0.3 ms", "late in 3 blocks",
     )  # fmt: skip
     places = [page.index(words) for words in order]
     assert places == sorted(places)

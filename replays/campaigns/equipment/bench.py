@@ -153,7 +153,8 @@ class Bench(Closing):
         self.name = f"bench-{os.getpid()}-{next(_NUMBERS)}"
         self._program: Program | None = None
         self._clients: list[Rig] = []
-        self._late = self._late_before = 0
+        self.late = self._late_before = 0
+        """Late blocks of a rig in real time during the test, as counted last."""
         self.can_url: str | None = None
         """Address of the rig on a CAN bus, for `rig.connect` and `Daq.open`; None without a bus."""
         self.socketcand_url: str | None = None
@@ -218,10 +219,10 @@ class Bench(Closing):
 
     def late_blocks(self) -> int:
         """Return the number of blocks that missed their deadline in real time since the test began."""
-        if self.target.owns_rig and self.pace == "real-time":
+        if self.target.replay is None and self.pace == "real-time":
             with contextlib.suppress(RefusedError, ConnectionError):  # the rig has ended; the last count remains
-                self._late = self.status()["overruns"] - self._late_before
-        return self._late
+                self.late = self.status()["overruns"] - self._late_before
+        return self.late
 
     # ---- what tests use ----
 
@@ -266,9 +267,9 @@ class Bench(Closing):
         Raises:
             BenchError: If the rig had ended with an error, or another process took its place.
         """
+        self.late_blocks()  # while the rig still responds
         if not self.target.owns_rig:
             return
-        self.late_blocks()  # while the rig still responds
         assert self._program is not None
         if (status := self._program.status) not in (None, 0):
             raise BenchError(f"the rig exited with status {status}: {self._program.last_line}")

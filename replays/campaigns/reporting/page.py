@@ -90,9 +90,11 @@ def _failure(report: Report, case: Document, folder: Path) -> None:
 
 
 def _measurements(report: Report, results: Document, case: Document) -> None:
-    floor = results["wall"]["cases"].get(case["id"], {}).get("floor_ms")
-    judge_value = "" if floor is None else f" Round trip: median {floor[0]:g} ms, maximum {floor[1]:g} ms."
-    caption = f"Resolution of reaction times: {case['resolution']}.{judge_value}" if case["resolution"] else ""
+    wall = results["wall"]["cases"].get(case["id"], {})
+    floor, late = wall.get("floor_ms"), wall.get("late_blocks", 0)
+    live = "" if floor is None else f" Round trip: median {floor[0]:g} ms, maximum {floor[1]:g} ms."
+    live += f" The rig was late in {late} blocks." if late else ""
+    caption = f"Resolution of reaction times: {case['resolution']}.{live}" if case["resolution"] else ""
     rows = [
         Row((
             each["name"], format_number(each["value"], each["unit"], "nothing"), format_limit(each),

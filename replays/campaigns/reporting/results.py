@@ -115,6 +115,7 @@ class Results:
         return self._cases.setdefault(name, {
             "outcome": "interrupted", "reason": "", "duration_s": 0.0, "title": "", "measurements": [],
             "evidence": [], "bench": None, "resolution": "", "troubles": [], "floor_ms": None,
+            "late_blocks": 0,
         })  # fmt: skip
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
@@ -143,9 +144,10 @@ class Results:
             if name not in self._cases:
                 self._case(name)["reason"] = "not run"
             case = self._cases[name]
-            reported = {key: value for key, value in case.items() if key not in ("duration_s", "floor_ms")}
+            clock = {key: case[key] for key in ("floor_ms", "late_blocks")}
+            reported = {key: value for key, value in case.items() if key not in ("duration_s", *clock)}
             cases.append({"id": name, **reported, "repeat": self._repeat(name)})
-            wall[name] = {"duration_s": round(case["duration_s"], 3), "floor_ms": case["floor_ms"]}
+            wall[name] = {"duration_s": round(case["duration_s"], 3), **clock}
         counts = {outcome: sum(case["outcome"] == outcome for case in cases) for outcome in OUTCOMES}
         titles = list(dict.fromkeys(case["title"] for case in cases if case["title"]))
         return replace_nonfinite({

@@ -17,6 +17,8 @@ from rig.cli.output.folder import check_folder
 from rig.cli.output.tables import echo, progress_bar
 
 _INTERRUPTED = 130
+_CASE_S, _BLOCK_S = 1.6, 2.4
+"""Processor time of a case, and of a second of 1 ms blocks, for estimates; measured with the monitor that ships [s]."""
 _EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
 
 
@@ -41,6 +43,7 @@ def campaign(
     against: Annotated[
         Path | None, typer.Option("--against", metavar="FOLDER", help="Compare with the results of an earlier campaign")
     ] = None,
+    list_cases: Annotated[bool, typer.Option("--list", help="List the cases and their number; run nothing")] = False,
     device: Annotated[
         str | None,
         typer.Option(metavar="COMMAND", help="Command line of your device, with the file's placeholders ({url}, ...)"),
@@ -91,7 +94,10 @@ def campaign(
         parse_identity(identity or [])
         for file in sheet:
             check_sheet(file)
-    files = _check_files(files, against, replay, device, limit or (), yes=yes)
+    files = _check_files(files, against, replay, device, limit or (), yes=yes or list_cases)
+    if list_cases:
+        _list_cases(files, device, limit or ())
+        return
     plugin_options = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
     plugin_options["--rig-device"] = device
     options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
@@ -112,6 +118,23 @@ def _list() -> None:
     for name, path in find_shipped().items():
         echo(textwrap.fill(f"{name}: {read_title(path)}", 80, subsequent_indent="  "))
     echo(f"files in {FOLDER}")
+
+
+def _list_cases(files: list[str], device: str | None, limits: Sequence[str]) -> None:
+    """Print the cases of campaign files, with an estimate of their time."""
+    from replays.campaigns.files.campaign import SUFFIX, load_campaign
+
+    count, processor_s = 0, 0.0
+    for file in files:
+        name, _, chosen = file.partition("::")
+        if not name.endswith(SUFFIX):
+            echo(f"{name}: tests of pytest; list them by pytest --collect-only")
+            continue
+        for case in load_campaign(Path(name), device, limits).cases:
+            if chosen in ("", case.id):
+                echo(f"{Path(name).name}::{case.id}  {case.duration_s:g} s")
+                count, processor_s = count + 1, processor_s + _CASE_S + _BLOCK_S * case.duration_s / case.bench.block_ms
+    echo(f"{count} cases, about {processor_s:.0f} s of processor time")
 
 
 def _check_files(
