@@ -33,7 +33,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of campaigns."""
     group = parser.getgroup("rig", "campaigns on a rotor-stator rig")
     group.addoption("--rig-results", metavar="FOLDER", help="write results.json, junit.xml, index.html and evidence/")
-    group.addoption("--rig-against", metavar="FOLDER", help="results of an earlier campaign to compare with")
+    group.addoption(
+        "--rig-against", metavar="FOLDER", action="append", help="results of an earlier campaign to compare with"
+    )
+    group.addoption("--rig-force", action="store_true", help="replace results in a folder that no campaign wrote")
     group.addoption("--rig-url", metavar="URL", help="run on the rig there instead of on rigs of the tests' own")
     group.addoption("--rig-device", metavar="COMMAND", help="command line of the device under test in TOML campaigns")
     group.addoption("--rig-limit", metavar="NAME=QUANTITY", action="append", help="limit that replaces the file's")
@@ -56,7 +59,8 @@ def pytest_configure(config: pytest.Config) -> None:
         if replay:
             validate_replay(Path(replay))
         if folder:
-            results = Results(Path(folder), None if against is None else Path(against), config)
+            earlier = [Path(each) for each in against or ()]
+            results = Results(Path(folder), earlier, config, force=config.option.rig_force)
             config.pluginmanager.register(results, "rig-results")
     except (InputError, DiskError) as error:
         raise pytest.UsageError(str(error)) from None

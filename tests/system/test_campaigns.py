@@ -324,7 +324,7 @@ def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(tm
         tmp_path, "test_open.py", "-k", "test_pass or test_skip or (test_open and not fail)", status=3
     )
     assert [case["outcome"] for case in document["cases"]] == ["passed", "inconclusive", "skipped"]
-    assert "OPEN  test_open.py::test_open: gap must be <= 1 mm; inconclusive: nothing moved" in out
+    assert "INCONCLUSIVE test_open.py::test_open: gap must be <= 1 mm; inconclusive: nothing moved" in out
     (error,) = ElementTree.parse(tmp_path / "out/junit.xml").getroot().iter("error")
     assert error.get("type") == "inconclusive"
     run_campaign(tmp_path, "test_open.py", "-k", "test_skip", status=3)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +18,7 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.campaigns.equipment.bench import BenchSettings, Target, validate_replay
+from replays.campaigns.equipment.bench import Bench, BenchSettings, Target, validate_replay
 from replays.campaigns.evidence import Trial
 from replays.campaigns.files.campaign import find_shipped, load_campaign
 from replays.campaigns.files.case_results import CaseRecording
@@ -27,6 +30,7 @@ from replays.campaigns.reporting.picture import draw
 from replays.campaigns.reporting.results import Results, load_results, write_junit
 from replays.campaigns.reporting.sheet import check_sheet, make_sheet, parse_identity
 from replays.report import junit, write_report
+from replays.report.document import Table
 from rig.base.checks import check
 from rig.base.errors import InputError
 from rig.base.outcome import Outcome
@@ -326,7 +330,7 @@ def test_the_page_lists_failures_first_then_changes(tmp_path: Path) -> None:
     failed = judge_value("peak", 1.5, "mm", "<=", 1.0, channels=("disk_x",))
     draw(session, folder / "event.png", [failed], origin_s=0.0, about_s=0.03)
     now["cases"][1]["evidence"] = ["evidence/bad/event.png"]
-    write_report(make_page(now, tmp_path, then), tmp_path / "index.html")
+    write_report(make_page(now, tmp_path, [then]), tmp_path / "index.html")
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     order = (
         "1 failed, 1 error, 1 skipped, 1 passed.", "</a>: no rig</li>", "failed: x.campaign.toml::bad</h2>",
@@ -341,7 +345,10 @@ def test_the_page_lists_failures_first_then_changes(tmp_path: Path) -> None:
 def test_the_sheet_has_identity_verdicts_digests_and_room_to_sign(tmp_path: Path) -> None:
     found, left = results(good=0.4, bad=-0.25), results(good=0.4, bad=0.1, fresh=0.2)
     left["cases"], left["counts"] = left["cases"][:3], {**dict.fromkeys(left["counts"], 0), "passed": 3}
-    left["cases"][0]["digests"] = {"x.campaign.toml": "0a1b", "session.mcap of good": "2c3d"}
+    left["wall"]["cases"]["x.campaign.toml::good"]["digests"] = {
+        "x.campaign.toml": "0a1b",
+        "session.mcap of good": "2c3d",
+    }
     write_report(make_sheet(left, tmp_path, parse_identity(["serial=A7", "site = Lyngby"]), found), tmp_path / "s.html")
     page = " ".join(re.sub(r"<[^>]*>", " ", (tmp_path / "s.html").read_text(encoding="utf-8")).split())
     for text in (
@@ -368,11 +375,86 @@ def test_a_truncated_recording_cannot_be_a_bench(tmp_path: Path) -> None:
 
 def test_two_campaigns_cannot_write_into_one_folder(tmp_path: Path) -> None:
     config = cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None)))
-    first = Results(tmp_path / "out", None, config)
+    first = Results(tmp_path / "out", (), config)
     with pytest.raises(InputError, match=r"^--output must be a folder that no other running campaign writes to"):
-        Results(tmp_path / "out", None, config)
+        Results(tmp_path / "out", (), config)
     first.pytest_sessionfinish(cast("Any", None))
-    Results(tmp_path / "out", None, config).pytest_sessionfinish(cast("Any", None))
+    Results(tmp_path / "out", (), config).pytest_sessionfinish(cast("Any", None))
+
+
+def test_a_campaign_that_is_killed_leaves_a_folder_of_its_own(tmp_path: Path) -> None:
+    config = cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None)))
+    with end_results(Results(tmp_path / "out", (), config)):
+        (tmp_path / "out/evidence/a").mkdir(parents=True)
+        shutil.copytree(tmp_path / "out", tmp_path / "killed")
+    with end_results(Results(tmp_path / "killed", (), config)):
+        assert not (tmp_path / "killed/evidence").exists()
+
+
+@contextmanager
+def end_results(started: Results) -> Iterator[None]:
+    yield
+    started.pytest_sessionfinish(cast("Any", None))
+
+
+def test_late_blocks_and_inconclusive_cases_are_shown(tmp_path: Path) -> None:
+    document = results(good=0.4, open=0.1)
+    document["cases"][1]["outcome"] = "inconclusive"
+    document["counts"] |= {"inconclusive": 1, "failed": 0}
+    document["wall"]["cases"]["x.campaign.toml::good"]["late_blocks"] = 7
+    (counts, *_), cases = (
+        [part for part in make_page(document, tmp_path).parts if isinstance(part, Table) and name in part.headings]
+        for name in ("inconclusive", "late blocks")
+    )
+    assert counts.rows[0].cells[counts.headings.index("inconclusive")] == "1"
+    assert [row.cells[-2:] for row in cases[0].rows if row.cells[0].endswith("good")] == [("7", "passed")]
+    write_junit(document, tmp_path / "junit.xml")
+    good, unsure, *_ = check_junit(tmp_path / "junit.xml")
+    properties = [{each.get("name"): each.get("value") for each in suite.iter("property")} for suite in (good, unsure)]
+    assert (properties[0]["late blocks"], properties[0]["inconclusive"]) == ("7", "0")
+    assert (properties[1]["outcome"], properties[1]["inconclusive"]) == ("inconclusive", "1")
+
+
+def test_a_late_rig_of_somebody_else_is_counted_until_the_test_ends() -> None:
+    bench, overruns = object.__new__(Bench), iter((10, 13, 15, 99))
+    bench.target, bench.pace, bench.late = Target(url="zenoh:elsewhere"), "real-time", 0
+    cast("Any", bench).status = lambda: {"overruns": next(overruns), "time_s": 1.5}
+    assert bench.begin() == 1.5
+    assert bench.late_blocks() == 3
+    bench.stop()
+    assert bench.late_blocks() == 5
+
+
+def test_the_trend_has_a_column_for_each_campaign(tmp_path: Path) -> None:
+    first, second, now = results(good=0.4), results(good=0.3, fresh=0.2), results(good=-0.1)
+    for number, each in enumerate((first, second), 1):
+        each["wall"]["begun"] = f"2025-01-0{number}"
+    (trend,) = (
+        part for part in make_page(now, tmp_path, [first, second]).parts
+        if isinstance(part, Table) and "2: 2025-01-02" in part.headings
+    )  # fmt: skip
+    rows = {row.cells[:2]: row.cells[2:] for row in trend.rows}
+    assert rows["x.campaign.toml::good", "outcome"] == ("passed", "passed", "failed")
+    assert rows["x.campaign.toml::good", "margin of peak"] == ("0.4 mm", "0.3 mm", "-0.1 mm")
+    assert rows["x.campaign.toml::fresh", "margin of peak"] == ("", "0.2 mm", "")
+
+
+def test_texts_of_devices_cannot_break_the_documents(tmp_path: Path) -> None:
+    hostile = "</td><script>alert(1)</script>]]>&\ud800\x00\x1b[2J\u202e$\\frac{$"
+    document = results(good=0.4, bad=-0.1)
+    for case in document["cases"]:
+        case |= {"reason": hostile, "title": hostile, "troubles": [hostile], "repeat": hostile}
+        for each in case["measurements"]:
+            each |= {"name": hostile, "note": hostile, "source": hostile}
+    document["titles"] = [hostile]
+    write_report(make_page(document, tmp_path, [document]), tmp_path / "index.html")
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "<script" not in page
+    assert not {"\x00", "\x1b", "\u202e"} & set(page)
+    write_junit(document, tmp_path / "junit.xml")
+    good, *_ = check_junit(tmp_path / "junit.xml")
+    name = next(each.get("name") for each in good.iter("property") if ".note" in str(each.get("name")))
+    assert name == "</td><script>alert(1)</script>]]>&[2J\u202e$\\frac{$.note"
 
 
 def test_invalid_results_are_reported(tmp_path: Path) -> None:
@@ -388,6 +470,7 @@ def test_invalid_results_are_reported(tmp_path: Path) -> None:
         (["cases", 0, "measurements", 0, "margin"], "0.4", r"cases\.0\.measurements\.0\.margin"),
         (["cases", 0, "outcome"], "great", r"cases\.0\.outcome"),
         (["cases", 0, "id"], None, r"cases\.0\.id"), (["cases"], {}, "cases"), (["wall"], [], "wall"),
+        (["wall", "cases", "x.campaign.toml::good", "duration_s"], "1", "wall.cases"),
     ):  # fmt: skip
         altered: Any = results(good=0.4)
         holder = altered
@@ -404,6 +487,9 @@ def test_a_folder_with_files_of_others_is_left_as_it_is(name: str, tmp_path: Pat
     file = tmp_path / name
     file.parent.mkdir(exist_ok=True)
     file.write_text("{}", encoding="utf-8")
+    config = cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None)))
     with pytest.raises(InputError, match=f"--output must be a folder without {name.partition('/')[0]}"):
-        Results(tmp_path, None, cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None))))
+        Results(tmp_path, (), config)
     assert file.read_text(encoding="utf-8") == "{}"
+    with end_results(Results(tmp_path, (), config, force=True)):
+        assert not (tmp_path / "evidence").exists()

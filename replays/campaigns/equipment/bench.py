@@ -155,6 +155,7 @@ class Bench(Closing):
         self._clients: list[Rig] = []
         self.late = self._late_before = 0
         """Late blocks of a rig in real time during the test, as counted last."""
+        self._is_counting = False
         self.can_url: str | None = None
         """Address of the rig on a CAN bus, for `rig.connect` and `Daq.open`; None without a bus."""
         self.socketcand_url: str | None = None
@@ -214,14 +215,14 @@ class Bench(Closing):
         if self.target.owns_rig and self.pace == "lockstep":
             return 0.0
         status = self.status()
-        self._late_before = status["overruns"]
+        self._late_before, self._is_counting = status["overruns"], self.pace == "real-time"
         return float(status["time_s"])
 
     def late_blocks(self) -> int:
-        """Return the number of blocks that missed their deadline in real time since the test began."""
-        if self.target.replay is None and self.pace == "real-time":
+        """Return the number of blocks of the rig that missed their deadline in real time during the test."""
+        if self._is_counting:
             with contextlib.suppress(RefusedError, ConnectionError):  # the rig has ended; the last count remains
-                self.late = self.status()["overruns"] - self._late_before
+                self.late = max(0, self.status()["overruns"] - self._late_before)
         return self.late
 
     # ---- what tests use ----
@@ -267,7 +268,8 @@ class Bench(Closing):
         Raises:
             BenchError: If the rig had ended with an error, or another process took its place.
         """
-        self.late_blocks()  # while the rig still responds
+        self.late_blocks()  # while the rig still responds, and before the evaluation loads the machine
+        self._is_counting = False
         if not self.target.owns_rig:
             return
         assert self._program is not None

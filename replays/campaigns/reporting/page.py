@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,13 @@ _MAX_LISTED = 20
 """Number of evidence files that the page lists for a case."""
 
 
-def make_page(results: Document, folder: Path, earlier: Document | None = None) -> Report:
+def make_page(results: Document, folder: Path, earlier: Sequence[Document] = ()) -> Report:
     """Return the page of a campaign's results.
 
     Args:
         results: Content of results.json.
         folder: Folder that holds the evidence.
-        earlier: Results of an earlier campaign to compare with.
+        earlier: Results of earlier campaigns to compare with, the oldest first.
     """
     counts, cases = results["counts"], results["cases"]
     bad = [case for case in cases if _MARKS[case["outcome"]] == "bad"]
@@ -42,15 +42,19 @@ def make_page(results: Document, folder: Path, earlier: Document | None = None) 
         "processes found by": wall["containment"],
     }
     report = Report("; ".join(results["titles"]) or "Campaign", f"{summary}.", origin=origin, mark=mark)
+    report.table(tuple(counts), [[str(count) for count in counts.values()]])
     for case in [*bad, *unsure]:
         _failure(report, case, folder)
-    if earlier is not None:
-        _trend(report, results, earlier)
+    if earlier:
+        _trend(report, results, earlier[-1])
+    if earlier[1:]:
+        _history(report, [*earlier, results])
     report.heading("Cases")
     rows = sorted(cases, key=lambda case: list(_MARKS).index(case["outcome"]))
     report.table(
-        ("case", "why", "time [s]", "outcome"),
-        [Row((case["id"], case["reason"], _seconds(results, case), case["outcome"]), _MARKS[case["outcome"]])
+        ("case", "why", "time [s]", "late blocks", "outcome"),
+        [Row((case["id"], case["reason"], _seconds(results, case), str(_wall(results, case).get("late_blocks") or 0),
+              case["outcome"]), _MARKS[case["outcome"]])
          for case in rows],
     )  # fmt: skip
     report.heading("Measurements")
@@ -62,7 +66,11 @@ def make_page(results: Document, folder: Path, earlier: Document | None = None) 
 
 
 def _seconds(results: Document, case: Document) -> str:
-    return f"{results['wall']['cases'].get(case['id'], {}).get('duration_s', 0.0):.1f}"
+    return f"{_wall(results, case).get('duration_s', 0.0):.1f}"
+
+
+def _wall(results: Document, case: Document) -> Document:
+    return results["wall"]["cases"].get(case["id"], {})
 
 
 def _failure(report: Report, case: Document, folder: Path) -> None:
@@ -90,8 +98,7 @@ def _failure(report: Report, case: Document, folder: Path) -> None:
 
 
 def _measurements(report: Report, results: Document, case: Document) -> None:
-    wall = results["wall"]["cases"].get(case["id"], {})
-    floor, late = wall.get("floor_ms"), wall.get("late_blocks", 0)
+    floor, late = _wall(results, case).get("floor_ms"), _wall(results, case).get("late_blocks", 0)
     live = "" if floor is None else f" Round trip: median {floor[0]:g} ms, maximum {floor[1]:g} ms."
     live += f" The rig was late in {late} blocks." if late else ""
     caption = f"Resolution of reaction times: {case['resolution']}.{live}" if case["resolution"] else ""
@@ -129,6 +136,23 @@ def _trend(report: Report, results: Document, earlier: Document) -> None:
         return
     caption = f"Changes of outcomes and margins since the campaign of {begun}."
     report.table(("case", "quantity", "earlier", "now", "change"), rows, caption=caption)
+
+
+def _history(report: Report, campaigns: Sequence[Document]) -> None:
+    """Add a table of outcomes and margins with a column for each campaign."""
+    report.heading("Trend")
+    rows: dict[tuple[str, str], list[str]] = {}
+    for number, campaign in enumerate(campaigns):
+        for case in campaign["cases"]:
+            cells = {"outcome": case["outcome"]}
+            for each in case["measurements"]:
+                if each["margin"] is not None:
+                    cells[f"margin of {each['name']}"] = format_number(each["margin"], each["unit"])
+            for of, cell in cells.items():
+                rows.setdefault((case["id"], of), [""] * len(campaigns))[number] = cell
+    begun = [f"{n}: {each['wall']['begun']}" for n, each in enumerate(campaigns, 1)]
+    caption = "Outcomes and margins of each campaign, the oldest first; the last one is this campaign."
+    report.table(("case", "quantity", *begun), [(*name, *cells) for name, cells in rows.items()], caption=caption)
 
 
 def changes(then: Document, now: Document) -> Iterator[Row]:

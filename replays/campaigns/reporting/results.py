@@ -10,6 +10,7 @@ import os
 import shlex
 import shutil
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -31,6 +32,10 @@ _JUNIT: dict[str, junit.Outcome] = {
     "failed": "failure", "error": "error", "interrupted": "error", "inconclusive": "inconclusive",
     "skipped": "skipped", "passed": "passed",
 }  # fmt: skip
+_WALL_FIELDS = ("floor_ms", "late_blocks", "digests")
+"""Fields of a case that depend on the wall clock; a recording has its times of arrival."""
+_OUTPUT = ("results.json", "junit.xml", "index.html", "evidence")
+"""Files and folder that a campaign writes, and replaces."""
 _MAX_REASON_LENGTH = 2000
 _UNFINISHED = "the run ended before this case was finished"
 
@@ -47,8 +52,13 @@ class _EarlierCase(StrictModel, extra="ignore"):
     measurements: list[_EarlierMeasurement]
 
 
+class _EarlierTime(StrictModel, extra="ignore"):
+    duration_s: float
+
+
 class _EarlierWall(StrictModel, extra="ignore"):
     begun: str
+    cases: dict[str, _EarlierTime]
 
 
 class _EarlierResults(StrictModel, extra="ignore"):
@@ -63,22 +73,26 @@ class Results:
 
     Args:
         folder: Output folder, created if missing.
-        against: Results of an earlier campaign.
+        against: Results of earlier campaigns, the oldest first.
         config: Configuration of the pytest run.
+        force: Whether a folder that no campaign wrote may be used.
 
     Raises:
-        InputError: If another campaign writes to the folder, or the earlier results cannot be read.
+        InputError: If another campaign writes to the folder, the folder has files that no campaign wrote, or the
+            earlier results cannot be read.
         DiskError: If the folder cannot be created.
     """
 
-    def __init__(self, folder: Path, against: Path | None, config: pytest.Config) -> None:
+    def __init__(self, folder: Path, against: Sequence[Path], config: pytest.Config, *, force: bool = False) -> None:
+        self._earlier = [load_results(each) for each in against]
+        check_output(folder, force=force)
         self._lock = _lock_folder(folder)
         self._folder, self._config = folder, config
-        self._earlier = None if against is None else load_results(against)
-        _remove_evidence(folder)
+        shutil.rmtree(folder / "evidence", ignore_errors=True)  # of the results that are overwritten
         self._cases: dict[str, dict[str, Any]] = {}
         self._planned: dict[str, None] = {}
         self._begun_s = time.time()
+        self._write_results()  # a campaign that is killed leaves a folder that the next one recognises
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
         """Record the collected tests."""
@@ -114,17 +128,15 @@ class Results:
     def _case(self, name: str) -> dict[str, Any]:
         return self._cases.setdefault(name, {
             "outcome": "interrupted", "reason": "", "duration_s": 0.0, "title": "", "measurements": [],
-            "evidence": [], "bench": None, "resolution": "", "troubles": [], "floor_ms": None,
-            "late_blocks": 0,
+            "evidence": [], "bench": None, "resolution": "", "troubles": [],
+            "floor_ms": None, "late_blocks": 0, "digests": {},
         })  # fmt: skip
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
         """Write all result files."""
         if hasattr(self._config, "workerinput"):
             return
-        document = self.document()
-        with whole_file(self._folder / "results.json") as draft:
-            draft.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        document = self._write_results()
         write_junit(document, self._folder / "junit.xml")
         from replays.campaigns.reporting.page import make_page
 
@@ -133,8 +145,15 @@ class Results:
             from replays.campaigns.reporting.sheet import make_sheet, parse_identity
 
             identity = parse_identity(self._config.option.rig_identity or [])
-            write_report(make_sheet(document, self._folder, identity, self._earlier), Path(sheet))
+            as_found = self._earlier[0] if self._earlier else None
+            write_report(make_sheet(document, self._folder, identity, as_found), Path(sheet))
         os.close(self._lock)
+
+    def _write_results(self) -> dict[str, Any]:
+        document = self.document()
+        with whole_file(self._folder / "results.json") as draft:
+            draft.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        return document
 
     def document(self) -> dict[str, Any]:
         """Return the results as a JSON document."""
@@ -144,7 +163,7 @@ class Results:
             if name not in self._cases:
                 self._case(name)["reason"] = "not run"
             case = self._cases[name]
-            clock = {key: case[key] for key in ("floor_ms", "late_blocks")}
+            clock = {key: case[key] for key in _WALL_FIELDS}
             reported = {key: value for key, value in case.items() if key not in ("duration_s", *clock)}
             cases.append({"id": name, **reported, "repeat": self._repeat(name)})
             wall[name] = {"duration_s": round(case["duration_s"], 3), **clock}
@@ -171,24 +190,6 @@ class Results:
         more += [("--limit", each) for each in self._config.getoption("rig_limit") or ()]
         options = [word for option, value in more if value for word in (option, value)]
         return shlex.join(["rig", "campaign", f"{file}{colons}{rest}", *options])
-
-
-def _remove_evidence(folder: Path) -> None:
-    """Remove the evidence of an earlier campaign, whose results will be overwritten.
-
-    Raises:
-        InputError: If the folder holds files of these names that are not of a campaign.
-    """
-    files = [name for name in ("results.json", "junit.xml", "index.html", "evidence") if os.path.lexists(folder / name)]
-    if not files:
-        return
-    try:
-        load_results(folder)
-    except InputError:
-        must = f"a folder without {files[0]}, or one with the results of an earlier campaign"
-        raise InputError("--output", must, str(folder)) from None
-    if not (folder / "evidence").is_symlink():
-        shutil.rmtree(folder / "evidence", ignore_errors=True)
 
 
 def _lock_folder(folder: Path) -> int:
@@ -249,6 +250,22 @@ def load_results(folder: Path) -> dict[str, Any]:
     return document
 
 
+def check_output(folder: Path, *, force: bool) -> None:
+    """Raise an error for a folder with files of a campaign's names that no campaign wrote.
+
+    Raises:
+        InputError: If there are such files and `force` is not set.
+    """
+    found = [name for name in _OUTPUT if os.path.lexists(folder / name)]
+    if not found or force:
+        return
+    try:
+        load_results(folder)
+    except InputError:
+        must = f"a folder without {found[0]}, or one with the results of an earlier campaign, unless --force is given"
+        raise InputError("--output", must, str(folder)) from None
+
+
 def write_junit(document: dict[str, Any], path: Path) -> None:
     """Write the results as JUnit XML, one suite per case because only a suite can hold a case's measurements.
 
@@ -264,7 +281,9 @@ def write_junit(document: dict[str, Any], path: Path) -> None:
             file.replace("/", "."), name or file, _JUNIT[case["outcome"]], case["reason"], "\n".join(lines),
             wall.get("duration_s", 0.0),
         )  # fmt: skip
-        suites.append(junit.Suite(case["id"], [one], list(_properties(case)), document["wall"]["begun"]))
+        properties = [("outcome", case["outcome"]), ("inconclusive", str(int(case["outcome"] == "inconclusive")))]
+        properties += [("late blocks", str(late))] if (late := wall.get("late_blocks")) else []
+        suites.append(junit.Suite(case["id"], [one], [*properties, *_properties(case)], document["wall"]["begun"]))
     junit.write_junit(path, suites, name="; ".join(document["titles"]))
 
 

@@ -91,7 +91,7 @@ def make_sheet(
             if (folder / file).suffix == ".png" and (folder / file).is_file():
                 report.parts.append(Picture((folder / file).read_bytes(), f"Signals and events: {case['id']}."))
     report.heading("Digests (SHA-256)")
-    digests = {file: digest for case in results["cases"] for file, digest in case.get("digests", {}).items()}
+    digests = {file: digest for case in wall["cases"].values() for file, digest in case.get("digests", {}).items()}
     report.table(("file", "digest"), list(digests.items()))
     report.heading("Signatures")
     report.table(

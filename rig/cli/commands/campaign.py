@@ -40,8 +40,12 @@ def campaign(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for results, reports and evidence")
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace files of the output folder that no campaign wrote")
+    ] = False,
     against: Annotated[
-        Path | None, typer.Option("--against", metavar="FOLDER", help="Compare with the results of an earlier campaign")
+        list[Path] | None,
+        typer.Option(metavar="FOLDER", help="Compare with an earlier campaign; repeatable, the oldest first"),
     ] = None,
     list_cases: Annotated[bool, typer.Option("--list", help="List the cases and their number; run nothing")] = False,
     device: Annotated[
@@ -85,7 +89,10 @@ def campaign(
     if url is not None and jobs > 1:
         raise InputError("--jobs", "1 with --url, as the cases share one rig", jobs)
     if output is not None:
+        from replays.campaigns.reporting.results import check_output
+
         check_folder(output, field="--output")
+        check_output(output, force=force)
     if sheet:
         from replays.campaigns.reporting.sheet import check_sheet, parse_identity
 
@@ -94,15 +101,16 @@ def campaign(
         parse_identity(identity or [])
         for file in sheet:
             check_sheet(file)
-    files = _check_files(files, against, replay, device, limit or (), yes=yes or list_cases)
+    files = _check_files(files, against or (), replay, device, limit or (), yes=yes or list_cases)
     if list_cases:
         _list_cases(files, device, limit or ())
         return
-    plugin_options = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
-    plugin_options["--rig-device"] = device
+    plugin_options = {"--rig-results": output, "--rig-url": url, "--rig-replay": replay, "--rig-device": device}
     options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
     options += ["-k", keyword] if keyword is not None else []
     options += [word for each in limit or () for word in ("--rig-limit", each)]
+    options += [word for each in against or () for word in ("--rig-against", str(each))]
+    options += ["--rig-force"] if force else []
     options += [word for each in sheet or () for word in ("--rig-sheet", str(each.absolute()))]
     options += [word for each in identity or () for word in ("--rig-identity", each)]
     options += ["-x"] if exit_first else []
@@ -139,7 +147,7 @@ def _list_cases(files: list[str], device: str | None, limits: Sequence[str]) -> 
 
 def _check_files(
     files: list[str],
-    against: Path | None,
+    against: Sequence[Path],
     replay: Path | None,
     device: str | None,
     limits: Sequence[str],
@@ -173,8 +181,8 @@ def _check_files(
             raise InputError("FILE", f"a file that ends in {SUFFIX} or .py, or a folder", name)
     if count > MAX_UNCONFIRMED_CASES and not yes:
         raise InputError("--yes", f"given for more than {MAX_UNCONFIRMED_CASES:,} cases", Words(f"{count} cases"))
-    if against is not None:
-        load_results(against)
+    for each in against:
+        load_results(each)
     if replay is not None:
         from replays.campaigns.equipment.bench import validate_replay
 

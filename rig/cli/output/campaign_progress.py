@@ -14,7 +14,13 @@ import pytest
 from rig.base.text import printable
 from rig.cli.output.tables import echo, plain_text
 
-OUTCOME_WORDS = {"passed": "pass", "failed": "FAIL", "error": "ERROR", "inconclusive": "OPEN", "skipped": "skip"}
+OUTCOME_WORDS = {
+    "passed": "pass",
+    "failed": "FAIL",
+    "error": "ERROR",
+    "inconclusive": "INCONCLUSIVE",
+    "skipped": "skip",
+}
 """Words printed for each outcome of a case."""
 
 
@@ -92,6 +98,8 @@ class ProgressPlugin:
             self.done.add(name)
             self.running.pop(name, None)
             reason = f": {self.reasons[name]}" if name in self.reasons else ""
+            if late := getattr(report, "rig", {}).get("late_blocks"):
+                reason += f" (the rig was late in {late} blocks)"
             for line in f"{OUTCOME_WORDS[outcome]:5} {name}{reason}".split("\n"):
                 self._print_line(line)
             self._show()
