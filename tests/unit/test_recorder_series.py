@@ -19,6 +19,7 @@ import pytest
 import recorder.output.series
 from recorder.contents.metadata import Beginning
 from recorder.files.payload import Payload
+from recorder.files.unfinished_file import Draft
 from recorder.output.disk_limits import DiskLimits
 from recorder.output.series import Series, part_path
 from recorder.output.sink import Needs
@@ -358,6 +359,29 @@ def test_a_replaced_file_is_an_error_and_is_not_published(how, tmp_path, items):
     if how != "append":
         saved = [payload for _, payload in Recording.open(tmp_path / "run.saved.mcap.part").payloads(PROBES)]
         assert saved == [payload for key, payload in items[:200] if key == PROBES]
+
+
+@pytest.mark.parametrize("moment", ["before", "during"])
+def test_a_file_replaced_at_its_end_is_an_error(moment, tmp_path, monkeypatch):
+    draft, rename = Draft(tmp_path / "run.mcap"), Path.replace
+
+    def replace(*_: object) -> None:
+        monkeypatch.undo()
+        rename(draft.part, tmp_path / "away")
+        draft.part.write_bytes(b"old!")
+        if moment == "during":
+            rename(draft.part, draft.path)
+
+    draft.write(b"data")
+    if moment == "before":
+        replace()
+    else:
+        monkeypatch.setattr(Path, "replace", replace)
+    with pytest.raises(OSError, match="was replaced"):
+        draft.finish()
+    draft.close()
+    assert draft.path.exists() == (moment == "during")
+    assert draft.part.read_bytes() == b"data"
 
 
 def test_the_digest_is_that_of_the_file(tmp_path, items):

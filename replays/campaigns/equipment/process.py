@@ -67,10 +67,7 @@ class Program:
     def status(self) -> int | None:
         """Exit status (128 plus the signal number if killed), or None while it runs."""
         status = self._supervisor.poll()
-        if status is None or status >= 0:
-            return status
-        self._kill_marked()  # the supervisor was killed
-        return 128 - status
+        return status if status is None or status >= 0 else 128 - status
 
     @property
     def output_bytes(self) -> int:
