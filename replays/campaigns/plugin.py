@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from replays.campaigns.files.campaign import Case
 
 _SUFFIX = ".campaign.toml"
+_NODE_ID_FIELD = "_nodeid"
+"""Field of a test's name, for which pytest has no public one."""
 _TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
 _FAILED = pytest.StashKey[bool]()
 _MARKER = (
@@ -37,6 +39,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--rig-against", metavar="FOLDER", action="append", help="results of an earlier campaign to compare with"
     )
     group.addoption("--rig-force", action="store_true", help="replace results in a folder that no campaign wrote")
+    group.addoption("--rig-repeat", metavar="N", type=int, default=1, help="number of runs of each case")
     group.addoption("--rig-url", metavar="URL", help="run on the rig there instead of on rigs of the tests' own")
     group.addoption("--rig-device", metavar="COMMAND", help="command line of the device under test in TOML campaigns")
     group.addoption("--rig-limit", metavar="NAME=QUANTITY", action="append", help="limit that replaces the file's")
@@ -71,6 +74,16 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
     return CampaignFile.from_parent(parent, path=file_path) if file_path.name.endswith(_SUFFIX) else None
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Name the tests of a campaign with results by their files alone, so that results from any folder compare."""
+    if config.option.rig_results:
+        from replays.campaigns.reporting.file_names import name_files
+
+        names = name_files({item.path for item in items})
+        for item in items:
+            setattr(item, _NODE_ID_FIELD, "::".join([names[item.path], *item.nodeid.split("::")[1:]]))
+
+
 class CampaignFile(pytest.File):
     """A campaign file in TOML."""
 
@@ -101,11 +114,11 @@ class CampaignItem(pytest.Item):
     def runtest(self) -> None:
         """Run the case."""
         from replays.campaigns.equipment.bench import UnsupportedError
-        from replays.campaigns.files.run import run_case
+        from replays.campaigns.files.run import run_repeatedly
 
         trial = self.stash[_TRIAL]
         try:
-            run_case(self.case, trial)
+            run_repeatedly(self.case, trial, self.config.option.rig_repeat, lambda: _get_trial(self))
         except UnsupportedError as error:
             pytest.skip(str(error))
         finally:

@@ -375,6 +375,11 @@ def test_many_cases_need_a_confirmation(tmp_path: Path, capsys: pytest.CaptureFi
         each.write_text(HEAD + PEAK + speeds.format([3.0], list(range(501))), encoding="utf-8")
     status, _, err = run_captured(capsys, "campaign", file, other)
     assert (status, err) == (2, "rig: --yes must be given for more than 1,000 cases; received 1002 cases\n")
+    status, _, err = run_captured(capsys, "campaign", file, "--repeat", 2)
+    assert (status, err) == (2, "rig: --yes must be given for more than 1,000 cases; received 1002 cases\n")
+    status, _, err = run_captured(capsys, "campaign", "recorder-acceptance", "--repeat", 2)
+    assert status == 2
+    assert "--repeat must be left out, except for *.campaign.toml files; received 2 for" in err
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -18,13 +18,15 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.campaigns.equipment.bench import Bench, BenchSettings, Target, validate_replay
+from replays.campaigns import plugin
+from replays.campaigns.equipment.bench import Bench, BenchError, BenchSettings, Target, validate_replay
 from replays.campaigns.evidence import Trial
 from replays.campaigns.files.campaign import find_shipped, load_campaign
 from replays.campaigns.files.case_results import CaseRecording
 from replays.campaigns.files.expectation import KINDS
-from replays.campaigns.files.run import end_device, measure_end
+from replays.campaigns.files.run import end_device, measure_end, run_repeatedly
 from replays.campaigns.measurement import Measurement, Must, judge_value
+from replays.campaigns.reporting.file_names import name_files
 from replays.campaigns.reporting.page import changes, make_page
 from replays.campaigns.reporting.picture import draw
 from replays.campaigns.reporting.results import Results, load_results, write_junit
@@ -493,3 +495,71 @@ def test_a_folder_with_files_of_others_is_left_as_it_is(name: str, tmp_path: Pat
     assert file.read_text(encoding="utf-8") == "{}"
     with end_results(Results(tmp_path, (), config, force=True)):
         assert not (tmp_path / "evidence").exists()
+
+
+def repeat(monkeypatch: pytest.MonkeyPatch, pace: str, *runs: dict[str, float] | str) -> list[Measurement]:
+    """Run a case once for each element: its times [ms] by name, or the error of the bench."""
+    left = iter(runs)
+
+    def run_case(_: Any, trial: Trial) -> None:
+        found = next(left)
+        trial.bench = cast("Any", SimpleNamespace(pace=pace, close=lambda: None, can_url="", url="", name="",
+                                                  socketcand_url="", slcan_path=""))  # fmt: skip
+        if isinstance(found, str):
+            raise BenchError(found)
+        for name, value in found.items():
+            trial.take(judge_value(name, value, "ms", "<=", 10.0))
+
+    monkeypatch.setattr("replays.campaigns.files.run.run_case", run_case)
+    trial = Trial("a")
+    try:
+        run_repeatedly(cast("Any", None), trial, len(runs), lambda: Trial("a"))
+    finally:
+        trial.close(failed=False)
+    return trial.measurements
+
+
+def test_runs_that_are_alike_keep_their_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    time, alike = repeat(monkeypatch, "lockstep", {"time": 3.0}, {"time": 3.0}, {"time": 3.0})
+    assert (time.outcome, alike.outcome, alike.note) == (Outcome.PASS, Outcome.PASS, "3 of 3 alike")
+    time, alike = repeat(monkeypatch, "lockstep", {"time": 30.0}, {"time": 30.0})
+    assert (time.outcome, alike.outcome) == (Outcome.FAIL, Outcome.PASS)
+    time, alike = repeat(monkeypatch, "real-time", {"time": 3.0}, {"time": 4.0})  # only the verdict counts
+    assert (time.outcome, alike.note) == (Outcome.PASS, "2 of 2 alike")
+    (time,) = repeat(monkeypatch, "lockstep", {"time": 3.0})
+    assert time.good
+    with pytest.raises(BenchError, match="no rig"):
+        repeat(monkeypatch, "lockstep", "no rig", "no rig")
+
+
+def test_what_differs_between_runs_is_inconclusive(monkeypatch: pytest.MonkeyPatch) -> None:
+    last = math.nextafter(3.0, 4.0)
+    runs = {"time": 3.0, "count": 1.0}, {"time": 3.0, "count": 1.0}, {"time": last, "count": 1.0}
+    time, count, alike = repeat(monkeypatch, "lockstep", *runs)
+    assert [each.outcome for each in (time, count, alike)] == [Outcome.INCONCLUSIVE, Outcome.PASS, Outcome.INCONCLUSIVE]
+    assert alike.open_reason == f"2 of 3 alike: run 3: time is {last!r} ms, pass, not 3.0 ms, pass"
+    time, alike = repeat(monkeypatch, "real-time", {"time": 30.0}, {"time": 3.0})
+    assert (time.outcome, alike.open_reason) == (
+        Outcome.INCONCLUSIVE,
+        "1 of 2 alike: run 2: time is pass, not fail",
+    )
+    (time, alike) = repeat(monkeypatch, "lockstep", {"time": 30.0}, "the rig exited")
+    assert [each.outcome for each in (time, alike)] == [Outcome.INCONCLUSIVE] * 2
+    assert "run 2: error is the rig exited, not missing" in alike.open_reason
+    (alike,) = repeat(monkeypatch, "lockstep", "the rig exited", {})
+    assert "run 2: error is missing, not the rig exited" in alike.open_reason
+
+
+def test_names_of_cases_depend_on_the_file_alone() -> None:
+    paths = [Path(each) for each in ("/a/x.py", "/b/x.py", "/b/y.py", "/c/b/x.py")]
+    assert list(map(name_files(paths).get, paths)) == ["a/x.py", "/b/x.py", "y.py", "c/b/x.py"]
+    assert name_files(paths[:1]) == {paths[0]: "x.py"}
+    items: Any = [SimpleNamespace(path=path, nodeid=f"far/{path.name}::C::case=1") for path in paths[:3]]
+    plugin.pytest_collection_modifyitems(cast("Any", SimpleNamespace(option=SimpleNamespace(rig_results=""))), items)
+    assert not hasattr(items[0], "_nodeid")
+    plugin.pytest_collection_modifyitems(cast("Any", SimpleNamespace(option=SimpleNamespace(rig_results="out"))), items)
+    assert [vars(each)["_nodeid"] for each in items] == [
+        "a/x.py::C::case=1",
+        "b/x.py::C::case=1",
+        "y.py::C::case=1",
+    ]

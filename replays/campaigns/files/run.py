@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from replays.campaigns.equipment.bench import UnsupportedError
+from replays.campaigns.equipment.bench import BenchError, UnsupportedError
 from replays.campaigns.equipment.cleanup import KILLED
 from replays.campaigns.evidence import MAX_FILES
 from replays.campaigns.files.case_results import CaseRecording
 from replays.campaigns.files.expectation import expected_events
-from replays.campaigns.measurement import Measurement, Must
+from replays.campaigns.measurement import Measurement, Must, with_unit
 from rig.base import wire
 from rig.base.errors import RefusedError
 from rig.run.commands.table import TimedCommand
@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from replays.campaigns.equipment.device import Device
     from replays.campaigns.evidence import Trial
     from replays.campaigns.files.campaign import Case, Step
+
+REPETITION_NAME = "runs alike"
+"""Name of the measurement that counts the runs that are like the first one."""
+_MAX_DIFFERENCES = 4
+"""Number of differences between runs that are listed."""
 
 
 def run_case(case: Case, trial: Trial) -> None:
@@ -182,3 +187,61 @@ def _measure_device(device: Device, results: CaseRecording, trial: Trial, lost: 
         note = f"it {'left lockstep' if left_s else 'ended'} before the run; may_end = true allows it"
         name, at_s = f"early ends of {device.name}", left_s[0] if left_s else None
         trial.take(Measurement(name, 1.0, Must("==", 0.0, "1"), note=note, at_s=at_s))
+
+
+def run_repeatedly(case: Case, trial: Trial, count: int, new_trial: Callable[[], Trial]) -> None:
+    """Run a case several times; what differs between the runs becomes inconclusive.
+
+    Args:
+        case: The case.
+        trial: Trial of the first run, which keeps the measurements.
+        count: Number of runs.
+        new_trial: Makes the trials of the other runs.
+
+    Raises:
+        BenchError: If the rig, a device or the recording fails in the same way in every run.
+        UnsupportedError: If the bench cannot do what the case needs.
+    """
+    if count == 1:
+        run_case(case, trial)
+        return
+    runs: list[dict[str, list[str]]] = []
+    errors: list[Exception] = []
+    for number in range(count):
+        current, error = trial if number == 0 else new_trial(), ""
+        try:
+            run_case(case, current)
+        except (BenchError, ConnectionError, TimeoutError) as caught:
+            errors.append(caught)
+            error = current.mask_addresses(str(caught))
+        finally:
+            if current is not trial:
+                current.close(failed=False)
+        runs.append({**({"error": [error]} if error else {}), **_list_findings(current)})
+    differences = {
+        name: f"run {number}: {name} is {_show(run, name)}, not {_show(runs[0], name)}"
+        for number, run in reversed(list(enumerate(runs[1:], 2)))
+        for name in {**runs[0], **run} if run.get(name) != runs[0].get(name)
+    }  # fmt: skip
+    if errors and not differences:
+        raise errors[0]
+    trial.measurements[:] = [
+        replace(each, open_reason=each.open_reason or differences.get(each.name, "")) for each in trial.measurements
+    ]
+    alike, reason = runs.count(runs[0]), "; ".join(list(differences.values())[:_MAX_DIFFERENCES])
+    must, note = Must("==", float(count), "1"), f"{alike} of {count} alike"
+    trial.take(Measurement(REPETITION_NAME, float(alike), must, note=note, open_reason=reason and f"{note}: {reason}"))
+
+
+def _list_findings(trial: Trial) -> dict[str, list[str]]:
+    """Return verdicts and, in lockstep, values by the name of the measurement."""
+    in_lockstep = trial.bench is not None and trial.bench.pace == "lockstep"
+    found: dict[str, list[str]] = {}
+    for each in trial.measurements:
+        value = f"{with_unit(repr(each.value), each.must.unit)}, " if in_lockstep else ""
+        found.setdefault(each.name, []).append(f"{value}{each.outcome.value}")
+    return found
+
+
+def _show(run: dict[str, list[str]], name: str) -> str:
+    return " and ".join(run.get(name, ["missing"]))

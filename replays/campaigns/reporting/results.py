@@ -91,12 +91,14 @@ class Results:
         shutil.rmtree(folder / "evidence", ignore_errors=True)  # of the results that are overwritten
         self._cases: dict[str, dict[str, Any]] = {}
         self._planned: dict[str, None] = {}
+        self._files: dict[str, str] = {}
         self._begun_s = time.time()
         self._write_results()  # a campaign that is killed leaves a folder that the next one recognises
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
         """Record the collected tests."""
         self._planned |= {item.nodeid: None for item in session.items}
+        self._files |= {item.nodeid: item.location[0] for item in session.items}
 
     def pytest_xdist_node_collection_finished(self, node: Any, ids: list[str]) -> None:
         """Record the tests that a worker process of pytest-xdist collected."""
@@ -107,8 +109,9 @@ class Results:
         if report.failed:
             self._case(report.nodeid).update(outcome="error", reason=_line(str(report.longrepr)))
 
-    def pytest_runtest_logstart(self, nodeid: str) -> None:
+    def pytest_runtest_logstart(self, nodeid: str, location: tuple[str, int | None, str]) -> None:
         """Mark a test as started."""
+        self._files[nodeid] = location[0]
         self._case(nodeid)["reason"] = _UNFINISHED
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -182,7 +185,7 @@ class Results:
     def _repeat(self, name: str) -> str:
         """Return the command that repeats this case."""
         path, colons, rest = name.partition("::")
-        whole = self._config.rootpath / path
+        whole = self._config.rootpath / self._files.get(name, path)
         file = os.path.relpath(whole, self._config.invocation_params.dir)
         if whole.parent == Path(__file__).parents[1]:  # a shipped campaign has a name
             file = whole.name.partition(".")[0]

@@ -64,6 +64,7 @@ def campaign(
         list[str] | None,
         typer.Option(metavar="NAME=TEXT", help="Identity on the sheet: name, serial, firmware, operator; repeatable"),
     ] = None,
+    repeat: Annotated[int, typer.Option(metavar="N", min=1, help="Run each case N times and compare the runs")] = 1,
     yes: Annotated[bool, typer.Option("--yes", help="Run more than 1,000 cases")] = False,
     url: Annotated[
         str | None, typer.Option(metavar="URL", help="Use the rig at this URL; skip cases that it cannot run")
@@ -101,7 +102,7 @@ def campaign(
         parse_identity(identity or [])
         for file in sheet:
             check_sheet(file)
-    files = _check_files(files, against or (), replay, device, limit or (), yes=yes or list_cases)
+    files = _check_files(files, against or (), replay, device, limit or (), repeat, yes=yes or list_cases)
     if list_cases:
         _list_cases(files, device, limit or ())
         return
@@ -114,6 +115,7 @@ def campaign(
     options += [word for each in sheet or () for word in ("--rig-sheet", str(each.absolute()))]
     options += [word for each in identity or () for word in ("--rig-identity", each)]
     options += ["-x"] if exit_first else []
+    options += ["--rig-repeat", str(repeat)]
     options += ["-n", str(jobs)] if jobs > 1 else ["-n", "0"] if importlib.util.find_spec("xdist") else []
     status = _run(files, options, output)
     if status:
@@ -151,6 +153,7 @@ def _check_files(
     replay: Path | None,
     device: str | None,
     limits: Sequence[str],
+    repeat: int,
     *,
     yes: bool,
 ) -> list[str]:
@@ -174,11 +177,13 @@ def _check_files(
             known = [each.id for each in load_campaign(Path(name), device, limits, max_cases=max_cases).cases]
             if colons and case not in known:
                 raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
-            count += 1 if colons else len(known)
+            count += repeat * (1 if colons else len(known))
         elif not Path(name).exists():
             raise InputError("FILE", f"a *{SUFFIX} file, or tests of pytest, that exists", name)
         elif Path(name).is_file() and not name.endswith(".py"):
             raise InputError("FILE", f"a file that ends in {SUFFIX} or .py, or a folder", name)
+        elif repeat > 1:
+            raise InputError("--repeat", f"left out, except for *{SUFFIX} files", Words(f"{repeat} for {name}"))
     if count > MAX_UNCONFIRMED_CASES and not yes:
         raise InputError("--yes", f"given for more than {MAX_UNCONFIRMED_CASES:,} cases", Words(f"{count} cases"))
     for each in against:

@@ -81,6 +81,7 @@ class ProgressPlugin:
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Record the end of a phase of a case; print the case after its last phase."""
+        from replays.campaigns.files.run import REPETITION_NAME
         from replays.campaigns.reporting.results import find_outcome, find_reason
 
         name = report.nodeid
@@ -98,6 +99,8 @@ class ProgressPlugin:
             self.done.add(name)
             self.running.pop(name, None)
             reason = f": {self.reasons[name]}" if name in self.reasons else ""
+            for each in getattr(report, "rig", {}).get("measurements", ()) if outcome == "passed" else ():
+                reason += f" ({each['note']})" if each["name"] == REPETITION_NAME else ""
             if late := getattr(report, "rig", {}).get("late_blocks"):
                 reason += f" (the rig was late in {late} blocks)"
             for line in f"{OUTCOME_WORDS[outcome]:5} {name}{reason}".split("\n"):
