@@ -241,6 +241,8 @@ def test_the_console_has_each_command_with_the_fields_of_the_table(name: str) ->
     requests: list[tuple[str, bytes]] = []
 
     class Rig:
+        rig = None
+
         def request(self, key: str, payload: bytes, **_: Any) -> bytes:
             requests.append((key, payload))
             return b'{"accepted": true, "id": 1, "tick": 0, "time_s": 0.0}'
