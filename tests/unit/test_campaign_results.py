@@ -32,7 +32,7 @@ from replays.campaigns.reporting.picture import draw
 from replays.campaigns.reporting.results import Results, load_results, write_junit
 from replays.campaigns.reporting.sheet import check_sheet, make_sheet, parse_identity
 from replays.report import junit, write_report
-from replays.report.document import Table
+from replays.report.document import Picture, Table
 from rig.base.checks import check
 from rig.base.errors import InputError
 from rig.base.outcome import Outcome
@@ -359,6 +359,13 @@ def test_the_sheet_has_identity_verdicts_digests_and_room_to_sign(tmp_path: Path
     ):  # fmt: skip
         assert text in page, text
     assert "FAIL: " in make_sheet(found, tmp_path, {}).lead
+    folder = tmp_path / "evidence/good"
+    (folder / "files").mkdir(parents=True)
+    for file in (folder / "event.png", folder / "files/event.png", folder / "mine.png"):
+        file.write_bytes(b"a picture")
+    left["cases"][0]["evidence"] = [str(file.relative_to(tmp_path)) for file in folder.rglob("*.png")]
+    pictures = [part for part in make_sheet(left, tmp_path, {}).parts if isinstance(part, Picture)]
+    assert len(pictures) == 1, "a device's pictures are not shown"
     for texts in (["serial"], ["=A7"], ["serial="], ["serial=1", "serial=2"]):
         with pytest.raises(InputError, match="--identity must be NAME=TEXT"):
             parse_identity(texts)

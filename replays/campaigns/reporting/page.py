@@ -11,9 +11,10 @@ from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.document import Picture
 
 Document = Mapping[str, Any]
-_MARKS: dict[str, Mark] = {
+CASE_MARKS: dict[str, Mark] = {
     "failed": "bad", "error": "bad", "inconclusive": "open", "interrupted": "open", "skipped": "open", "passed": "good",
 }  # fmt: skip
+"""Mark of each outcome of a case, the worst first."""
 _UNCHANGED_MARGIN = 1e-9
 """Relative change of a margin below which it counts as unchanged."""
 
@@ -30,10 +31,8 @@ def make_page(results: Document, folder: Path, earlier: Sequence[Document] = ())
         earlier: Results of earlier campaigns to compare with, the oldest first.
     """
     counts, cases = results["counts"], results["cases"]
-    bad = [case for case in cases if _MARKS[case["outcome"]] == "bad"]
+    bad = [case for case in cases if CASE_MARKS[case["outcome"]] == "bad"]
     unsure = [case for case in cases if case["outcome"] == "inconclusive"]
-    mark: Mark = "bad" if bad else "open" if unsure or counts["interrupted"] or not counts["passed"] else "good"
-    summary = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count) or "no case"
     wall = results["wall"]
     origin = {
         "begun": f"{wall['begun']} UTC, {wall['duration_s']:.1f} s",
@@ -41,7 +40,8 @@ def make_page(results: Document, folder: Path, earlier: Sequence[Document] = ())
         "rig": wall["rig"],
         "processes found by": wall["containment"],
     }
-    report = Report("; ".join(results["titles"]) or "Campaign", f"{summary}.", origin=origin, mark=mark)
+    title = "; ".join(results["titles"]) or "Campaign"
+    report = Report(title, f"{summarize_counts(counts)}.", origin=origin, mark=judge_counts(counts))
     report.table(tuple(counts), [[str(count) for count in counts.values()]])
     for case in [*bad, *unsure]:
         _failure(report, case, folder)
@@ -50,11 +50,11 @@ def make_page(results: Document, folder: Path, earlier: Sequence[Document] = ())
     if earlier[1:]:
         _history(report, [*earlier, results])
     report.heading("Cases")
-    rows = sorted(cases, key=lambda case: list(_MARKS).index(case["outcome"]))
+    rows = sorted(cases, key=lambda case: list(CASE_MARKS).index(case["outcome"]))
     report.table(
         ("case", "why", "time [s]", "late blocks", "outcome"),
         [Row((case["id"], case["reason"], _seconds(results, case), str(_wall(results, case).get("late_blocks") or 0),
-              case["outcome"]), _MARKS[case["outcome"]])
+              case["outcome"]), CASE_MARKS[case["outcome"]])
          for case in rows],
     )  # fmt: skip
     report.heading("Measurements")
@@ -85,11 +85,7 @@ def _failure(report: Report, case: Document, folder: Path) -> None:
         note = f" ({each['note']})" if each["note"] else ""
         verdict = "inconclusive" if each["outcome"] == "inconclusive" else f"it is {value}{margin}"
         report.text(f"{each['name']} must be {limit}; {verdict}{note}.{source}")
-    for file in case["evidence"]:
-        path = folder / file
-        if path.match("evidence/*/event.png") and path.is_file():  # a device's pictures are not shown
-            caption = "Signals and events around the failure."
-            report.parts.append(Picture(path.read_bytes(), caption))
+    add_picture(report, case, folder, "Signals and events around the failure.")
     for trouble in case["troubles"]:
         report.text(trouble)
     files = ", ".join(f"`{file}`" for file in case["evidence"][:_MAX_LISTED])
@@ -112,6 +108,26 @@ def _measurements(report: Report, results: Document, case: Document) -> None:
     ]  # fmt: skip
     headings = ("measurement", "value", "must be", "margin", "source", "note", "verdict")
     report.table(headings, rows, caption=caption)
+
+
+def summarize_counts(counts: Mapping[str, int]) -> str:
+    """Return the number of cases of each outcome, in words."""
+    return ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count) or "no case"
+
+
+def judge_counts(counts: Mapping[str, int]) -> Mark:
+    """Return the mark of a campaign from its number of cases of each outcome."""
+    if counts["failed"] or counts["error"]:
+        return "bad"
+    return "open" if counts["inconclusive"] or counts["interrupted"] or not counts["passed"] else "good"
+
+
+def add_picture(report: Report, case: Document, folder: Path, caption: str) -> None:
+    """Add the picture that the campaign drew of a case, if there is one; a device's pictures are not shown."""
+    for file in case["evidence"]:
+        path = folder / file
+        if path.match("evidence/*/event.png") and path.is_file():
+            report.parts.append(Picture(path.read_bytes(), caption))
 
 
 def format_number(value: float | None, unit: str, none: str = "") -> str:
@@ -166,7 +182,7 @@ def changes(then: Document, now: Document) -> Iterator[Row]:
             continue
         before, after = old[name], new[name]
         if before["outcome"] != after["outcome"]:
-            order = list(_MARKS)
+            order = list(CASE_MARKS)
             better = order.index(after["outcome"]) > order.index(before["outcome"])
             yield _row(name, "outcome", before["outcome"], after["outcome"], better=better)
         margins = {each["name"]: each for each in before["measurements"]}

@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from replays.campaigns.reporting.page import Document, format_limit, format_number
-from replays.report import OUTCOME_MARKS, Mark, Report, Row
-from replays.report.document import Picture
+from replays.campaigns.reporting.page import (
+    CASE_MARKS,
+    Document,
+    add_picture,
+    format_limit,
+    format_number,
+    judge_counts,
+    summarize_counts,
+)  # fmt: skip
+from replays.report import OUTCOME_MARKS, Report, Row
 from replays.report.writing import check_suffix
 from replays.studies.common import provenance
 from rig.base.errors import InputError
@@ -59,10 +66,12 @@ def make_sheet(
         as_found: Results of the first campaign on this device, before it was adjusted.
     """
     counts, wall = results["counts"], results["wall"]
-    mark = _mark(counts)
+    mark = judge_counts(counts)
+    if mark == "good" and counts["skipped"]:
+        mark = "open"  # a sheet of a test that is not complete
     verdict = {"good": "PASS", "bad": "FAIL", "open": "INCONCLUSIVE"}[mark]
-    summary = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count) or "no case"
-    report = Report(f"Test sheet: {'; '.join(results['titles'])}", f"{verdict}: {summary}.", mark=mark)
+    title = f"Test sheet: {'; '.join(results['titles'])}"
+    report = Report(title, f"{verdict}: {summarize_counts(counts)}.", mark=mark)
     report.heading("Identity")
     fields = {name: identity.get(name, _LINE) for name in IDENTITY} | dict(identity)
     origin = {"tested": f"{wall['begun']} UTC", "machine": wall["machine"], "rig": wall["rig"]}
@@ -74,7 +83,7 @@ def make_sheet(
     headings = ("case", "as found", "as left") if as_found is not None else ("case", "verdict")
     report.table(headings, [
         Row((case["id"], *([earlier.get(case["id"], "not tested")] if as_found is not None else []), case["outcome"]),
-            "good" if case["outcome"] == "passed" else "bad" if case["outcome"] in ("failed", "error") else "open")
+            CASE_MARKS[case["outcome"]])
         for case in results["cases"]
     ])  # fmt: skip
     report.heading("Measurements")
@@ -87,9 +96,7 @@ def make_sheet(
                  each["source"], each["outcome"]), OUTCOME_MARKS[each["outcome"]])
             for each in case["measurements"]
         ])  # fmt: skip
-        for file in case["evidence"]:
-            if (folder / file).suffix == ".png" and (folder / file).is_file():
-                report.parts.append(Picture((folder / file).read_bytes(), f"Signals and events: {case['id']}."))
+        add_picture(report, case, folder, f"Signals and events: {case['id']}.")
     report.heading("Digests (SHA-256)")
     digests = {file: digest for case in wall["cases"].values() for file, digest in case.get("digests", {}).items()}
     report.table(("file", "digest"), list(digests.items()))
@@ -98,10 +105,3 @@ def make_sheet(
         ("", "name", "date", "signature"), [(who, _LINE, _LINE, _LINE) for who in ("tested by", "approved by")]
     )
     return report
-
-
-def _mark(counts: Mapping[str, int]) -> Mark:
-    if counts["failed"] or counts["error"]:
-        return "bad"
-    unsure = counts["inconclusive"] or counts["interrupted"] or counts["skipped"]
-    return "open" if unsure or not counts["passed"] else "good"
