@@ -13,6 +13,7 @@ import typer
 
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.outcome import Outcome
+from rig.cli.options import Force
 from rig.cli.output.folder import check_folder
 from rig.cli.output.tables import echo, progress_bar
 
@@ -40,9 +41,7 @@ def campaign(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for results, reports and evidence")
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace files of the output folder that no campaign wrote")
-    ] = False,
+    force: Force = False,
     against: Annotated[
         list[Path] | None,
         typer.Option(metavar="FOLDER", help="Compare with an earlier campaign; repeatable, the oldest first"),
