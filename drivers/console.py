@@ -12,8 +12,8 @@ from functools import partialmethod
 from typing import Any, Self
 
 from rig.base import wire
-from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError
+from rig.base.files import Closing
 from rig.run.commands import SUMMARIES
 from rig.serve.devices import describe_waits
 from rig.serve.transport import DEFAULT_ENDPOINT, Client, NoReplyError, RigLostError

@@ -21,8 +21,8 @@ import numpy as np
 from drivers.link import LinkTimeoutError
 from drivers.sources import Source, open_source
 from drivers.sources.samples import RowBuffer, RowReader, Samples, StreamEndedError, follow
-from rig.base.closeable import Closing
 from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.files import Closing
 from rig.base.wire import Continuity, Gap
 from rig.serve.transport import RigLostError
 

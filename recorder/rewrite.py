@@ -27,8 +27,8 @@ from recorder.files.records import COPY
 from recorder.files.unfinished_file import check_destination
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from rig.base.checks import build_read_error, open_file
-from rig.base.errors import PART_SUFFIX, InputError, Words, check_output_differs
+from rig.base.errors import InputError, Words
+from rig.base.files import PART_SUFFIX, build_read_error, check_output_differs, open_file
 from rig.base.wire import EDGES, FAULTS, SENSORS, TRUTH, Block, encode_block, get_schema
 from rig.channels.faults.ledger import Declared
 

@@ -14,7 +14,7 @@ from drivers.instruments.magnet.twin import MagnetTwin
 from drivers.instruments.proximity.twin import ProximityTwin
 from drivers.link import Port
 from drivers.sources.stream import RigStream
-from rig.base.closeable import Closing
+from rig.base.files import Closing
 from rig.serve.transport import Client
 
 TWINS: tuple[type[Twin], ...] = (ProximityTwin, ForceTwin, AccelerometerTwin, HammerTwin, DriveTwin, MagnetTwin)

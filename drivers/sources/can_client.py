@@ -27,8 +27,8 @@ from drivers.can.signals import (
 )
 from drivers.sources.can import CanSource
 from rig.base import wire
-from rig.base.closeable import Closing
 from rig.base.errors import InputError, Words
+from rig.base.files import Closing
 from rig.serve.transport import NoReplyError
 from rig.serve.waiting import Deadline
 

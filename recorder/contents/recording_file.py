@@ -17,8 +17,9 @@ from recorder.files import schemas
 from recorder.files.chunks import Chunk, DamagedError, messages, unpack
 from recorder.files.payload import parse_block
 from recorder.files.records import COPY, MAGIC, read_contents
-from rig.base.checks import build_read_error, open_file, read_json
+from rig.base.checks import read_json
 from rig.base.errors import InputError, Words
+from rig.base.files import build_read_error, open_file
 from rig.base.wire import EVENTS, FAULTS, Block
 from rig.serve import stream_check
 

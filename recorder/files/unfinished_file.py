@@ -1,6 +1,6 @@
 """File of a recording in progress: NAME.mcap.part, locked by its recorder, renamed to NAME.mcap when complete.
 
-Unlike `rig.base.errors.whole_file`, an interrupted recording keeps its file, for `rig recover`.
+Unlike `rig.base.files.whole_file`, an interrupted recording keeps its file, for `rig recover`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from rig.base.errors import PART_SUFFIX, InputError, Words, check_new_file
+from rig.base.errors import InputError, Words
+from rig.base.files import PART_SUFFIX, check_new_file, open_file
 
 
 def get_part_path(path: Path) -> Path:
@@ -57,7 +58,7 @@ def remove(files: Iterable[Path]) -> None:
 
     files = list(files)
     for file in files:
-        with contextlib.suppress(FileNotFoundError), file.open("rb") as old:
+        with contextlib.suppress(FileNotFoundError), open_file(file) as old:
             try:
                 fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

@@ -23,8 +23,8 @@ from rerun.experimental import ViewerClient, ViewerState
 
 from recorder.viewer.canvas import PICTURE, SIMULATED
 from recorder.viewer.page import Page
-from rig.base.closeable import Closing
 from rig.base.errors import InputError, Words
+from rig.base.files import Closing, write_file
 from rig.serve.waiting import Deadline
 
 Kind = Literal["native", "web", "headless"]
@@ -204,7 +204,7 @@ class Window(Closing):
             before, picture = picture, self._request(lambda viewer: viewer.take_screenshot())
             if picture == before:
                 break
-        path.write_bytes(picture)
+        write_file(path, picture)
 
     def _request(self, request: Callable[[ViewerClient], _Reply]) -> _Reply:
         """Repeat a request to the viewer until the reply is not empty."""

@@ -25,7 +25,8 @@ from replays.recordings.formats.exporting.selection import select
 from replays.recordings.formats.readers import columnar, delimited
 from replays.recordings.resimulation.background import Background
 from rig.base import wire
-from rig.base.errors import PART_SUFFIX, InputError, Words, whole_file
+from rig.base.errors import InputError, Words
+from rig.base.files import PART_SUFFIX, whole_file
 from rig.base.text import replace_nonfinite
 from rig.physics.kernels.signals import ROW
 from rig.run.commands.table import FaultCommand

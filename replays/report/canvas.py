@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rig.base.errors import InputError, whole_file
+from rig.base.errors import InputError
+from rig.base.files import write_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -171,8 +172,7 @@ def save(figure: Figure, *paths: Path, source: str = "") -> list[Path]:
         check_suffix(path)
     for path in paths:
         data = _svg(figure, source) if path.suffix == ".svg" else png(figure, source=source)
-        with whole_file(path) as draft:
-            draft.write_bytes(data)
+        write_file(path, data)
     return list(paths)
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from replays.report.document import Report
-from rig.base.errors import InputError, check_new_file, whole_file
+from rig.base.errors import InputError
+from rig.base.files import check_new_file, write_file
 
 SUFFIXES = (".html", ".pdf")
 
@@ -23,8 +24,7 @@ def write_report(report: Report, path: Path) -> None:
     else:
         from replays.report.pdf import render
     data = render(report)
-    with whole_file(path) as draft:
-        draft.write_bytes(data)
+    write_file(path, data)
 
 
 def check_suffix(path: Path) -> None:

@@ -15,7 +15,7 @@ from recorder.reader import Recording
 from replays.recordings.export import McapRun
 from replays.recordings.validation import validate
 from replays.recordings.validation.outcome import Validation
-from rig.base.errors import whole_file
+from rig.base.files import write_file
 from rig.run.offline import frames
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
@@ -67,8 +67,7 @@ def make(
     step(session.name)
     _record(session, recording)
     validation = validate(Recording.open(recording), declared=True)
-    with whole_file(text) as draft:
-        draft.write_text(quantities_text(session, validation), encoding="utf-8")
+    write_file(text, quantities_text(session, validation))
     return recording, text
 
 

@@ -6,23 +6,20 @@ fields with ranges, and no others. Validated input is not checked again; invalid
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import json
 import math
-import os
 import re
-import stat
 import tomllib
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from rig.base.errors import InputError, RefusedError, Words, such_as
-from rig.base.text import find_similar, printable
+from rig.base.files import open_file
+from rig.base.text import printable
 
 DOCUMENT_BYTES = 16 << 20
 """Largest document of a rig or a recording [bytes]."""
@@ -119,34 +116,6 @@ def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUM
     if text.count("[") + text.count("{") > DEPTH:
         check_depth(document, field=field)
     return document
-
-
-def open_file(path: Path) -> BinaryIO:
-    """Open a regular file for reading; pipes and devices, which may never end or begin, are refused.
-
-    Raises:
-        OSError: The file cannot be read, or is not a regular file.
-    """
-
-    def opener(name: str, flags: int) -> int:
-        number = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
-        if not stat.S_ISREG(os.fstat(number).st_mode):
-            os.close(number)
-            raise OSError(errno.EINVAL, "not a regular file", name)
-        return number
-
-    return open(path, "rb", opener=opener)
-
-
-def build_read_error(path: Path, error: OSError) -> InputError:
-    """Return the error for an unreadable file, with similar names in its folder, such as an unfinished recording."""
-    names: list[str] = []
-    if isinstance(error, FileNotFoundError):
-        with contextlib.suppress(OSError):
-            names = sorted(each.name for each in path.parent.iterdir() if path.suffix in each.name)
-    names = [name for name in names if name.startswith(f"{path.stem}.")][:3] or find_similar(path.name, names)
-    such = f", such as {', '.join(str(path.with_name(name)) for name in names)}" if names else ""
-    return InputError("file", f"a file that can be read{such}", Words(f"{path} ({error.strerror})"))
 
 
 def read_toml(path: Path) -> dict[str, Any]:

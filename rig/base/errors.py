@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
 from importlib.util import find_spec
-from pathlib import Path
 
 from rig.base.text import Words as Words
 from rig.base.text import find_similar, format_value, printable
 
-PART_SUFFIX = ".part"
-"""Suffix of a file while it is written."""
 FULL_PACKAGES = frozenset({"scipy", "numba", "rerun", "matplotlib", "pyarrow", "jinja2", "fpdf"})
 """Import names of the packages in the extra `full`; clients of a rig do not need them."""
 INSTALL_COMMAND = "pip install 'rotor-stator-rig[full]'"
@@ -99,74 +94,3 @@ def describe_missing_package(error: ModuleNotFoundError) -> str | None:
 def is_full_missing() -> bool:
     """Return whether a package of the extra `full` is missing, without importing any."""
     return any(find_spec(module) is None for module in FULL_PACKAGES)
-
-
-def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: bool) -> None:
-    """Raise an error early for a file that cannot be written.
-
-    Args:
-        path: The file.
-        field: Name of the option, for errors.
-        suffixes: Allowed suffixes.
-        force: Allow replacing an existing file.
-
-    Raises:
-        InputError: The suffix is wrong, the folder is missing or read-only, or the file exists.
-    """
-    if path.suffix not in suffixes:  # also of a path without a name, such as "" and /
-        *others, last = suffixes
-        endings = f"{', '.join(others)} or {last}" if others else last
-        raise InputError(field, f"a file name that ends in {endings}", str(path))
-    try:
-        path.with_name(path.name + PART_SUFFIX).exists()
-    except OSError as error:  # a name that is too long
-        raise InputError(field, "a file name that the system accepts", Words(f"{path} ({error.strerror})")) from None
-    if not path.parent.is_dir():
-        raise InputError(field, "in a folder that exists", str(path))
-    if path.is_dir():
-        raise InputError(field, "a file, not a folder", str(path))
-    if path.exists() and not force:
-        raise InputError(field, "a new file (--force replaces one)", Words(f"{path}, which exists"))
-    try:
-        # Permissions alone are not sufficient: try it.
-        tempfile.TemporaryFile(dir=path.parent).close()
-    except OSError as error:
-        raise InputError(field, "in a folder that can be written", Words(f"{path} ({error.strerror})")) from None
-
-
-def check_output_differs(sources: list[Path], output: Path, *, field: str = "output") -> None:
-    """Raise an error for an output that is one of the sources, under any name.
-
-    Raises:
-        InputError: The output, or its temporary file, is one of the sources.
-    """
-    for candidate in (output, output.with_name(output.name + PART_SUFFIX)):
-        for source in sources:
-            with suppress(OSError):  # one of them does not exist
-                if source.samefile(candidate):
-                    raise InputError(field, "another file than those that are read", str(output))
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary file that replaces `path` if the block succeeds, and is removed otherwise.
-
-    Raises:
-        DiskError: The disk refused, whatever error the writing library raised.
-    """
-    draft = path.with_name(path.name + PART_SUFFIX)
-    try:
-        yield draft
-        draft.replace(path)
-    except (InputError, SimulationError, DiskError):
-        raise
-    except (OSError, RuntimeError, ValueError) as error:  # errors of writing libraries; any other is a bug
-        # A library that closes after a failure may fail again: the system's first error is reported.
-        reason, cause = str(error) or type(error).__name__, error
-        while cause is not None:
-            reason = (isinstance(cause, OSError) and cause.strerror) or reason
-            cause = cause.__context__
-        raise DiskError(f"{path} could not be written: {reason}; nothing of it is kept") from error
-    finally:
-        with suppress(OSError):
-            draft.unlink(missing_ok=True)

@@ -34,8 +34,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field
 
-from rig.base.checks import TOML_BYTES, Written, check, open_file, read_toml
+from rig.base.checks import TOML_BYTES, Written, check, read_toml
 from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.files import open_file
 from rig.base.text import printable
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import TABLE, Channel, ChannelTable, build_table, raw_groups

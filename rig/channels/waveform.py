@@ -10,8 +10,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from rig.base.checks import Written, open_file
+from rig.base.checks import Written
 from rig.base.errors import InputError, Words
+from rig.base.files import open_file
 
 _MAX_VALUES, _MAX_FILE_BYTES = 200_000, 8 << 20
 """Limits of a waveform's values and of its file size [bytes]; each recording contains the waveform."""

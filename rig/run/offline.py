@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rig.base.errors import InputError, UnknownNameError, Words, whole_file
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.files import whole_file
 from rig.base.samples import Samples, find_column, merge_samples
 from rig.channels.formula import check_computed
 from rig.channels.table import ChannelTable

@@ -24,7 +24,11 @@ import pytest
 from recorder.files.records import MAGIC
 from recorder.reader import Recording, join
 from recorder.rewrite import is_whole, recover
+from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats.source import open_source
+from replays.score.records.can_log import open_can_log
 from rig.base.errors import InputError
+from rig.channels.table import default_table
 from rig.cli.main import main
 from tests.hostile import InputTally, check_tallies, input_count
 from tests.hostile.files import (
@@ -377,13 +381,35 @@ def test_millions_of_tiny_records_are_refused_soon(record: bytes, tmp_path: Path
     assert time.monotonic() - begin < 10.0
 
 
-@pytest.mark.parametrize("command", ["info", "validate", "recover", "run"])
+@pytest.mark.parametrize(
+    ("command", "suffix"),
+    [*((name, ".mcap") for name in ("info", "validate", "recover")), ("run", ".toml"),
+     *(("score", suffix) for suffix in (".log", ".blf", ".asc", ".trc", ".csv", ".parquet", ".mf4", ".wav")),
+     *(("import", suffix) for suffix in (".uff", ".tdms", ".log"))],
+)  # fmt: skip
 def test_a_pipe_or_a_folder_is_refused_at_once(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    suffix = ".toml" if command == "run" else ".mcap"
     os.mkfifo(tmp_path / f"pipe{suffix}")
     (tmp_path / f"folder{suffix}").mkdir()
     for name in ("pipe", "folder"):
         assert _rig(command, str(tmp_path / f"{name}{suffix}")) == 2
         assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_compressed_data_are_measured_before_a_library_reads_them(tmp_path: Path) -> None:
+    packed = zlib.compress(bytes(300 << 20), 9)
+    blf = struct.pack("<4sI", b"LOGG", 144) + bytes(136)
+    container = struct.pack("<HH12x", 2, 0) + packed
+    blf += struct.pack("<4sHHII", b"LOBJ", 16, 1, 16 + len(container), 10) + container
+    mdf = struct.pack("<4s4xQQ2sBxIQQ", b"##DZ", 48 + len(packed), 0, b"DT", 0, 0, 300 << 20, len(packed)) + packed
+    (tmp_path / "bomb.blf").write_bytes(blf)
+    (tmp_path / "bomb.mf4").write_bytes(mdf)
+    tracemalloc.start()
+    with pytest.raises(InputError, match="at most 100 times its size"):
+        open_can_log(tmp_path / "bomb.blf", default_table())
+    with pytest.raises(InputError, match="at most 100 times its size"):
+        open_source(tmp_path / "bomb.mf4", FileOptions())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6

@@ -500,8 +500,23 @@ def test_a_folder_with_files_of_others_is_left_as_it_is(name: str, tmp_path: Pat
     with pytest.raises(InputError, match=f"--output must be a folder without {name.partition('/')[0]}"):
         Results(tmp_path, (), config)
     assert file.read_text(encoding="utf-8") == "{}"
+    if "evidence" in name:
+        with pytest.raises(InputError, match="--output must be a folder without evidence"):
+            Results(tmp_path, (), config, force=True)
+        assert file.read_text(encoding="utf-8") == "{}"
+        return
     with end_results(Results(tmp_path, (), config, force=True)):
         assert not (tmp_path / "evidence").exists()
+
+
+def test_evidence_is_not_written_through_a_link(tmp_path: Path) -> None:
+    config = cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None)))
+    with end_results(Results(tmp_path / "out", (), config)):
+        pass
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "out" / "evidence").symlink_to(tmp_path / "mine")
+    with pytest.raises(InputError, match="evidence is no symbolic link"):
+        Results(tmp_path / "out", (), config, force=True)
 
 
 def repeat(monkeypatch: pytest.MonkeyPatch, pace: str, *runs: dict[str, float] | str) -> list[Measurement]:

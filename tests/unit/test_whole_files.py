@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from rig.base.checks import read_toml
-from rig.base.errors import DiskError, InputError, check_new_file, check_output_differs, whole_file
+from rig.base.errors import DiskError, InputError
+from rig.base.files import check_new_file, check_output_differs, open_output, whole_file, write_file
 from rig.cli.app import start
 from rig.run.scenes import load_scene, parse_scene
 from rig.serve.transport.exposure.certificates import create_keys, read_holder
@@ -25,6 +26,26 @@ def test_any_library_error_is_one_line_with_the_file(error: Exception, tmp_path:
         draft.write_text("half")
         raise error
     assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("a.wav", "old")]
+
+
+def test_no_symbolic_link_is_followed(tmp_path: Path) -> None:
+    other, path, log = tmp_path / "other", tmp_path / "a.csv", tmp_path / "a.log"
+    other.write_text("kept")
+    for link in (path, log, path.with_name("a.csv.part"), tmp_path / ".a.csv.part"):
+        link.symlink_to(other)
+    write_file(path, "new")
+    assert (path.read_text(), path.is_symlink(), other.read_text()) == ("new", False, "kept")
+    assert path.stat().st_mode == other.stat().st_mode  # not the mode of temporary files
+    with pytest.raises(OSError, match="symbolic"):
+        open_output(log, "w")
+
+
+def test_a_draft_has_another_name_each_time(tmp_path: Path) -> None:
+    with whole_file(tmp_path / "a.csv") as one, whole_file(tmp_path / "a.csv") as two:
+        assert one != two
+        assert one.stat().st_size == two.stat().st_size == 0
+    with whole_file(tmp_path / ("x" * 240 + ".csv")) as draft:
+        assert draft.exists()
 
 
 def test_a_fault_of_the_program_is_not_blamed_on_the_disk(tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ from drivers.can.bus.model import BusModel, warm_up
 from drivers.can.bus.results import OUTCOMES
 from rig.base import wire
 from rig.base.checks import check
-from rig.base.closeable import Closing
 from rig.base.errors import InputError
+from rig.base.files import Closing
 from rig.serve.health import Guard, IncreaseWarning
 from rig.serve.transport.limit import Bucket
 

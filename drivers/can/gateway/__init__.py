@@ -25,7 +25,7 @@ from drivers.can.schedule import SLOT_S, Schedule
 from drivers.can.signals import EVENT_VALUES, EventKind, RigState
 from rig.base import wire
 from rig.base.checks import DOCUMENT_BYTES, StrictModel, check, input_error
-from rig.base.closeable import Closing
+from rig.base.files import Closing
 from rig.channels.table import ChannelTable
 from rig.serve.health import Guard, IncreaseWarning
 from rig.serve.stream_check import parse_block_end

@@ -17,8 +17,8 @@ from drivers.instruments.common.datasheet import Datasheet, parse_datasheet
 from drivers.instruments.common.protocol import Codec, InstrumentMessage, ProtocolError
 from drivers.link import QUEUE_MESSAGES, Link, LinkError, LinkTimeoutError, open_link
 from drivers.sources.samples import RowReader, Samples, follow
-from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError, Words
+from rig.base.files import Closing
 from rig.base.wire import Continuity
 from rig.channels.table import Group
 from rig.serve.waiting import Deadline

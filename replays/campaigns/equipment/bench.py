@@ -21,8 +21,8 @@ from replays.campaigns.equipment.cleanup import END_S
 from replays.campaigns.equipment.process import Program
 from rig.base import wire
 from rig.base.checks import Written
-from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError, Words
+from rig.base.files import Closing
 from rig.base.outcome import InconclusiveError
 from rig.channels.sampling import TICKS_HZ
 from rig.serve.transport.endpoint import free_port

@@ -11,7 +11,7 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING
 
 from replays.campaigns.equipment.bench import BenchError
-from rig.base.errors import PART_SUFFIX
+from rig.base.files import PART_SUFFIX
 from rig.base.outcome import InconclusiveError
 from rig.serve.waiting import Deadline, wait_until
 

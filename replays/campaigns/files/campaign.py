@@ -24,8 +24,9 @@ from replays.campaigns.files.event_fields import check_event
 from replays.campaigns.files.expectation import KINDS, Expect, find_selectors
 from replays.campaigns.files.line_numbers import find_line, number_lines
 from replays.campaigns.measurement import split_quantity
-from rig.base.checks import Written, build_read_error, check, open_file, parse_toml
+from rig.base.checks import Written, check, parse_toml
 from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.files import build_read_error, open_file
 from rig.channels.faults import find_channels, find_group
 from rig.channels.faults.blocks import BlockFault
 from rig.physics.kernels import signals

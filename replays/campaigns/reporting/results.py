@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from replays.campaigns.equipment.cleanup import find_containment
 from replays.report import junit, write_report
 from replays.studies.common import provenance
-from rig.base.checks import StrictModel, build_read_error, check, open_file, read_json
-from rig.base.errors import DiskError, InputError, whole_file
+from rig.base.checks import StrictModel, check, read_json
+from rig.base.errors import DiskError, InputError
+from rig.base.files import build_read_error, open_file, write_file
 from rig.base.text import printable, replace_nonfinite
 
 if TYPE_CHECKING:
@@ -154,8 +155,7 @@ class Results:
 
     def _write_results(self) -> dict[str, Any]:
         document = self.document()
-        with whole_file(self._folder / "results.json") as draft:
-            draft.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_file(self._folder / "results.json", json.dumps(document, indent=1, allow_nan=False) + "\n")
         return document
 
     def document(self) -> dict[str, Any]:
@@ -257,16 +257,21 @@ def check_output(folder: Path, *, force: bool) -> None:
     """Raise an error for a folder with files of a campaign's names that no campaign wrote.
 
     Raises:
-        InputError: If there are such files and `force` is not set.
+        InputError: If there are such files and `force` is not set, or the folder for evidence is not a campaign's.
     """
     found = [name for name in _OUTPUT if os.path.lexists(folder / name)]
-    if not found or force:
+    evidence = os.path.lexists(folder / "evidence")
+    if not found or (force and not evidence):
         return
     try:
         load_results(folder)
     except InputError:
-        must = f"a folder without {found[0]}, or one with the results of an earlier campaign, unless --force is given"
+        own = "" if evidence else ", unless --force is given"
+        name = "evidence" if evidence else found[0]
+        must = f"a folder without {name}, or one with the results of an earlier campaign{own}"
         raise InputError("--output", must, str(folder)) from None
+    if (folder / "evidence").is_symlink():
+        raise InputError("--output", "a folder whose evidence is no symbolic link", str(folder))
 
 
 def write_junit(document: dict[str, Any], path: Path) -> None:

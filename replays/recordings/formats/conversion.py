@@ -23,6 +23,7 @@ from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, con
 from replays.recordings.formats.mapping import Mapping
 from rig.base import wire
 from rig.base.errors import InputError
+from rig.base.files import open_file
 from rig.channels.table import ChannelTable, default_table
 
 TICK_RATE_HZ = 1_000_000
@@ -233,7 +234,7 @@ def _start_time(log: Log, zero_s: float) -> datetime:
 
 
 def _digest(path: Path) -> str:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

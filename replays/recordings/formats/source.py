@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from rig.base.checks import DOCUMENT_BYTES, build_read_error, describe_error, load_extensions, open_file, read_json
+from rig.base.checks import DOCUMENT_BYTES, describe_error, load_extensions, read_json
 from rig.base.errors import InputError, RefusedError, Words
+from rig.base.files import build_read_error, open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from replays.recordings.identification.fit import Identification
-from rig.base.errors import check_new_file, whole_file
+from rig.base.files import check_new_file, write_file
 from rig.physics.parameters import DEFAULT_SET, Parameter, load_parameters, set_names
 
 
@@ -67,8 +67,7 @@ def write_set(text: str, path: Path) -> None:
         named = Path(folder) / path.name
         named.write_text(text, encoding="utf-8")
         load_parameters(str(named))
-    with whole_file(path) as draft:
-        draft.write_text(text, encoding="utf-8")
+    write_file(path, text)
 
 
 def identification_document(result: Identification, *, recording: str) -> dict[str, Any]:

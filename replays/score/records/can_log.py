@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import io
+import struct
+from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from replays.score.records.recorded import Pieces, Recorded, RecordedTable
-from rig.base.checks import build_read_error
 from rig.base.errors import InputError, Words
+from rig.base.files import build_read_error, check_inflated, open_file
 from rig.channels.table import ChannelTable
 
 _SUFFIXES = (".log", ".asc", ".blf", ".trc")
+_BLF_HEAD, _BLF_OBJECT, _BLF_CONTAINER, _ZLIB = (
+    struct.Struct("<4sI"),
+    struct.Struct("<4sHHII"),
+    struct.Struct("<HH12x"),
+    2,
+)
 
 
 def is_can_log(path: Path) -> bool:
@@ -21,10 +32,33 @@ def is_can_log(path: Path) -> bool:
     if path.suffix.lower() != ".asc":
         return True
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return file.read(5).lower() == b"date "
     except OSError as error:
         raise build_read_error(path, error) from None
+
+
+def _open_reader(path: Path, file: BufferedReader) -> Any:
+    import can
+
+    if path.suffix.lower() == ".blf":
+        check_inflated(_find_containers(file), path.stat().st_size)
+        file.seek(0)
+        return can.BLFReader(file)
+    readers: dict[str, Any] = {".log": can.CanutilsLogReader, ".asc": can.ASCReader, ".trc": can.TRCReader}
+    return readers[path.suffix.lower()](io.TextIOWrapper(file, "utf-8", errors="replace"))
+
+
+def _find_containers(file: BufferedReader) -> Iterator[bytes]:
+    """Yield the compressed data of all containers of a BLF file."""
+    _, length = _BLF_HEAD.unpack(file.read(_BLF_HEAD.size))
+    file.seek(length)
+    while len(head := file.read(_BLF_OBJECT.size)) == _BLF_OBJECT.size:
+        _, _, _, size, kind = _BLF_OBJECT.unpack(head)
+        data = file.read(max(0, size - _BLF_OBJECT.size))
+        file.read(size % 4)
+        if kind == 10 and len(data) > _BLF_CONTAINER.size and _BLF_CONTAINER.unpack_from(data)[0] == _ZLIB:
+            yield data[_BLF_CONTAINER.size :]
 
 
 def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
@@ -37,8 +71,6 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
     Raises:
         InputError: The log cannot be read, or has none of the rig's samples.
     """
-    import can
-
     from drivers.can.signals import messages_for
     from drivers.sources.can import SampleDecoder
 
@@ -46,7 +78,7 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
     frames: dict[str, tuple[list[bytes], list[float]]] = {}
     rates = {"rate": next(iter(table.channels.values())).rate_hz}
     try:
-        with can.LogReader(path) as reader:
+        with open_file(path) as file, _open_reader(path, file) as reader:
             for frame in reader:
                 message = messages.by_identifier.get(frame.arbitration_id)
                 if message is None or frame.is_extended_id or frame.is_error_frame or frame.is_remote_frame:
@@ -57,6 +89,8 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
                     data, times_s = frames.setdefault(message.name, ([], []))
                     data.append(bytes(frame.data))
                     times_s.append(frame.timestamp)
+    except InputError:
+        raise
     except Exception as error:  # whatever python-can raises on a log that it cannot read
         reason = build_read_error(path, error) if isinstance(error, OSError) else None
         raise reason or InputError("FILE", "an intact CAN log", Words(f"{path} ({type(error).__name__})")) from None

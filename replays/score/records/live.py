@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rig.base.errors import InputError, RefusedError, Words
+from rig.base.files import open_output
 from rig.serve.waiting import Deadline
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ class Lines:
         self._source, self._path = source, path
         self._counts, self._unix_s = array("q"), array("d")
         self._whole = 0
-        self._file, self._lock = path.open("wb"), threading.Lock()
+        self._file, self._lock = open_output(path, "wb"), threading.Lock()
         threading.Thread(target=self._read, name="rows of the DAQ", daemon=True).start()
 
     def _read(self) -> None:

@@ -18,6 +18,7 @@ from replays.score.records.rows import take_rows
 from replays.score.records.scale import COUNTS
 from rig.base import units
 from rig.base.errors import InputError, UnknownNameError
+from rig.base.files import open_file
 from rig.base.wire import sensor_key
 from rig.channels.table import Channel, Group
 
@@ -31,6 +32,7 @@ _STEP_TOLERANCE = 0.2
 _REGULAR_PART, _MAX_ROUNDED = 0.9, 1.1
 """Part of equal steps above which stamps are not rounded to a coarse resolution, and largest deviation of such stamps
 from a line, peak to peak, over their largest step."""
+
 _MAX_SCATTER, _MIN_GAP = 5.0, 3.0
 """The same over the usual step for stamps of which some go back by jitter, and steps over the usual one from which rows
 are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak and steps of 2.5."""
@@ -300,7 +302,7 @@ def _fit_line(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
 
 
 def _ends_with_line_end(path: Path) -> bool:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         file.seek(-1, 2)
         return file.read(1) in (b"\n", b"\r", b"\0")  # UTF-16 ends with the line end's upper byte
 

@@ -22,8 +22,8 @@ from replays.studies.peers import PEERS, Library, Peer, Setting
 from replays.studies.peers.common.problem import ERROR_COLUMNS, Problem
 from replays.studies.peers.common.reference import Reference
 from replays.studies.peers.common.solution import Solution
-from rig.base.checks import build_read_error, open_file
-from rig.base.errors import InputError, UnknownNameError, Words, whole_file
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.files import build_read_error, open_file, write_file
 from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import STATE
 
@@ -74,8 +74,7 @@ def write_problem(phase: str, folder: Path) -> Path:
     }
     prepare_folder(folder)
     path = folder / f"problem-{phase}.json"
-    with whole_file(path) as draft:
-        draft.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_file(path, json.dumps(document, indent=1) + "\n")
     return path
 
 

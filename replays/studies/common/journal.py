@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rig.base.errors import InputError, Words
+from rig.base.files import open_file, open_output, write_file
 
 
 def prepare_folder(folder: Path) -> None:
@@ -56,16 +57,17 @@ class Journal:
             self._load(code)
 
     def _load(self, code: str) -> None:
-        text = self.path.read_text(encoding="utf-8")
+        with open_file(self.path) as file:
+            text = file.read().decode()
         if text and not text.endswith("\n"):  # an incomplete last line of a killed run
             text = text[: text.rfind("\n") + 1]
-            self.path.write_text(text, encoding="utf-8")
+            write_file(self.path, text)
         lines = [json.loads(line) for line in text.splitlines()]
         self.rows = [line for line in lines if line.get("code") == code]
         self.outdated = len(lines) - len(self.rows)
 
     def add(self, row: dict[str, Any]) -> None:
         """Append a line; it is written to disk before this returns."""
-        with self.path.open("a", encoding="utf-8") as file:
+        with open_output(self.path, "a") as file:
             file.write(json.dumps(row, allow_nan=False) + "\n")
         self.rows.append(row)

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 from rig.base.errors import InputError, Words
+from rig.base.files import open_file, write_file
 from rig.run.model_choice import Pick
 from rig.run.scenes import Scene, load_scene, pick_digests, scene_path
 
@@ -36,12 +37,10 @@ def write_pick(path: Path, scene_name: str, pick: Pick) -> None:
         InputError: If the file cannot be edited safely.
     """
     source = path if path.is_file() else scene_path(scene_name)
-    # newline="" preserves line endings.
-    with source.open(encoding="utf-8", newline="") as file:
-        old = file.read()
+    with open_file(source) as file:
+        old = file.read().decode()  # with its line endings
     new = with_pick(old, pick)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        file.write(new)
+    write_file(path.resolve(), new)  # a link to the scene is kept
 
 
 def with_pick(text: str, pick: Pick) -> str:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.base.errors import InputError, check_new_file, whole_file
+from rig.base.errors import InputError
+from rig.base.files import check_new_file, write_file
 from rig.cli.connections.can_output import CanMessages, bit_rates
 from rig.cli.options import ChannelFile
 from rig.cli.output.progress import reporting
@@ -111,8 +112,7 @@ def dbc(
     if output is None:
         echo_document(text(schedule.table))
         return
-    with whole_file(output) as draft:
-        draft.write_text(text(schedule.table), encoding="cp1252")
+    write_file(output, text(schedule.table).encode("cp1252"))
     echo(f"{output} written")
 
 

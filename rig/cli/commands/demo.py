@@ -9,6 +9,7 @@ from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.base.files import open_output
 from rig.cli.output.tables import Table, echo, new_table, table_console
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def _processes(log: Path) -> Iterator[Callable[..., Process]]:
     import sys
 
     started: list[Process] = []
-    file: IO[str] = log.open("w", encoding="utf-8")
+    file: IO[str] = open_output(log, "w")
 
     def start(*arguments: str) -> Process:
         # -P: a user's file in the working directory must not shadow a package of the rig.

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.base import units
-from rig.base.errors import InputError, Words, check_new_file, check_output_differs, whole_file
+from rig.base.errors import InputError, Words
+from rig.base.files import check_new_file, check_output_differs, write_file
 from rig.cli.options import Force
 from rig.cli.output.tables import Form, echo, echo_json, new_table
 
@@ -123,8 +124,7 @@ def _guess(
             check_output_differs(files, wanted, field=field)
     text, guesses = guess_mapping(files) if files else (example(), [])
     if path is not None:
-        with whole_file(path) as draft:
-            draft.write_text(text, encoding="utf-8")
+        write_file(path, text)
     if picture is not None:
         from replays.recordings.formats.guessing.overview import draw
 

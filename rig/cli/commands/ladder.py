@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.base.errors import whole_file
+from rig.base.files import write_file
 from rig.cli.options import Changes, SceneChanges, SceneName
 from rig.cli.output.folder import check_folder
 from rig.cli.output.progress import reporting
@@ -74,8 +74,7 @@ def ladder(
     if output is not None:
         paths = draw(result, output)
         paths.append(output / "ladder.json")
-        with whole_file(paths[-1]) as draft:
-            draft.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_file(paths[-1], json.dumps(document, indent=2, allow_nan=False) + "\n")
     if write is not None:
         write_pick(write, scene, make_pick(result))
     if form.as_json:

@@ -28,7 +28,7 @@ def recover(
     """
     from recorder.files.unfinished_file import check_destination
     from recorder.rewrite import recovered_path
-    from rig.base.checks import build_read_error, open_file
+    from rig.base.files import build_read_error, open_file
 
     if output is not None and len(files) > 1:
         raise InputError("--output", "used with one FILE", Words(f"{len(files)} files"))

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from rig.base.errors import InputError, Words, check_new_file, check_output_differs, whole_file
+from rig.base.errors import InputError, Words
+from rig.base.files import check_new_file, check_output_differs, write_file
 from rig.base.text import replace_nonfinite
 from rig.cli.connections.connection import Connection
 from rig.cli.groups import panel
@@ -123,10 +124,7 @@ def score(
     if junit is not None:
         write_junit(card, junit)
     if as_json is not None:
-        with whole_file(as_json) as draft:
-            draft.write_text(
-                json.dumps(replace_nonfinite(card.document()), indent=2, allow_nan=False) + "\n", encoding="utf-8"
-            )
+        write_file(as_json, json.dumps(replace_nonfinite(card.document()), indent=2, allow_nan=False) + "\n")
     _show(card, table_console(wide=wide), wide=wide)
     for target in (output, junit, as_json):
         if target is not None:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.base.errors import DiskError, InputError, RefusedError, Words, check_new_file, whole_file
+from rig.base.errors import DiskError, InputError, RefusedError, Words
+from rig.base.files import check_new_file, whole_file
 from rig.cli.connections.connection import Connection
 from rig.cli.options import Force, OptionalRecordingFiles
 from rig.cli.output.progress import reporting

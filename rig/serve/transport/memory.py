@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 
-from rig.base.closeable import Closing
+from rig.base.files import Closing
 from rig.serve.transport import NoReplyError
 
 

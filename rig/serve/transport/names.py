@@ -20,6 +20,7 @@ from pydantic import Field
 
 from rig.base.checks import StrictModel, check
 from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.files import open_file
 from rig.serve.transport import DEFAULT_ENDPOINT
 from rig.serve.transport.endpoint import parse_endpoint
 from rig.serve.waiting import Deadline
@@ -165,7 +166,7 @@ def _read_entry(file: Path) -> NamedRig | None:
     """Return the rig of a file; remove the file of an ended process."""
     import fcntl
 
-    with contextlib.suppress(FileNotFoundError), file.open("rb") as opened:
+    with contextlib.suppress(FileNotFoundError), open_file(file) as opened:
         try:
             fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

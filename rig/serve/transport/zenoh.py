@@ -16,8 +16,8 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rig.base import wire
-from rig.base.closeable import Closing
 from rig.base.errors import InputError
+from rig.base.files import Closing
 from rig.serve.transport import DEFAULT_ENDPOINT, NoReplyError
 from rig.serve.transport.endpoint import (
     build_address_error,

@@ -14,7 +14,8 @@ import numpy as np
 from replays.recordings.formats import clock
 from replays.recordings.formats.exporting.selection import ROWS, ExportChunk, ExportTable, Selection
 from replays.recordings.formats.source import formats, load_format
-from rig.base.errors import InputError, Words, check_new_file, check_output_differs, whole_file
+from rig.base.errors import InputError, Words
+from rig.base.files import check_new_file, check_output_differs, whole_file
 
 Method = Literal["polyphase", "linear"]
 _MAX_MISSING = 1_000_000

@@ -16,6 +16,7 @@ from replays.recordings.formats.readers.dialect import MISSING, Layout, find_lay
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, read_error
 from replays.recordings.resimulation.background import Background
 from rig.base.errors import InputError, Words
+from rig.base.files import open_file
 from rig.base.text import printable
 
 _BLOCK_BYTES = 1 << 21
@@ -104,7 +105,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
 
 def _first_fields(path: Path, layout: Layout) -> list[str]:
-    with path.open(encoding=layout.encoding) as file:
+    with io.TextIOWrapper(open_file(path), layout.encoding) as file:
         return layout.dialect.fields([file.readline() for _ in range(layout.first + 1)][layout.first])
 
 
@@ -188,7 +189,7 @@ def _parse_columns(
 
 def _last_line(path: Path, encoding: str) -> str:
     """Return the last non-empty line of a file, stripped."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         file.seek(max(0, path.stat().st_size - _LAST_BYTES))
         return file.read().decode(encoding, errors="replace").rstrip().rpartition("\n")[2].strip()
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.base import units
-from rig.base.checks import open_file
 from rig.base.errors import InputError, Words
+from rig.base.files import open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -25,7 +26,7 @@ from replays.recordings.formats.source import (
     read_error,
 )
 from rig.base import units
-from rig.base.checks import open_file
+from rig.base.files import check_inflated, open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.history import ExportEvent
@@ -108,8 +109,19 @@ def _documents(mdf: Any) -> dict[str, str]:
     return documents
 
 
+def _find_compressed_blocks(path: Path) -> Iterator[bytes]:
+    """Yield the data of all blocks that are compressed by zlib."""
+    with open_file(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for kind, header in ((b"##DZ", 48), (b"##AT", 96)):  # the size is the last field of both headers
+            begin = -1
+            while (begin := data.find(kind, begin + 1)) >= 0:
+                first = begin + header
+                yield data[first : first + int.from_bytes(data[first - 8 : first], "little")]
+
+
 def _open(path: Path) -> Any:
     asammdf = load_library("MDF", "asammdf")
+    check_inflated(_find_compressed_blocks(path), path.stat().st_size)
     file = open_file(path)
     finished = file.read(_HEAD)[-_FLAGS:] == bytes(_FLAGS)
     try:

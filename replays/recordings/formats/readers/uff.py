@@ -16,8 +16,8 @@ import numpy as np
 from replays.recordings.formats.exporting import export
 from replays.recordings.formats.source import Entry, FileSignal, Source, load_library, read_error
 from rig.base import units
-from rig.base.checks import open_file
 from rig.base.errors import InputError
+from rig.base.files import open_file
 from rig.base.text import printable
 
 if TYPE_CHECKING:

@@ -1,0 +1,191 @@
+"""Files: opening those from outside, writing those that are complete or absent, and closing.
+
+All input files are opened, and all output files written, by these functions; a test finds other calls. Outputs are
+written to a new file with a name that cannot be guessed, so that no symbolic link in the folder is followed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import stat
+import tempfile
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from io import BufferedReader
+from pathlib import Path
+from typing import IO, Any, Self
+
+from rig.base.errors import DiskError, InputError, SimulationError, Words
+from rig.base.text import find_similar
+
+PART_SUFFIX = ".part"
+"""Suffix of a file while it is written."""
+_MAX_NAME = 200
+_MAX_INFLATED, _MAX_RATIO = 256 << 20, 100
+
+
+def open_file(path: Path) -> BufferedReader:
+    """Open a regular file for reading; pipes and devices, which may never end or begin, are refused.
+
+    Raises:
+        OSError: The file cannot be read, or is not a regular file.
+    """
+
+    def opener(name: str, flags: int) -> int:
+        number = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            os.close(number)
+            raise OSError(errno.EINVAL, "not a regular file", name)
+        return number
+
+    return open(path, "rb", opener=opener)
+
+
+def check_inflated(blocks: Iterable[bytes], file_bytes: int) -> None:
+    """Refuse zlib data that would fill the memory: above 256 MB and above 100 times the size of the file.
+
+    Args:
+        blocks: All compressed blocks of a file; damaged ones are left to its reader.
+        file_bytes: Size of the file [bytes].
+
+    Raises:
+        InputError: The data are larger; not more than that is decompressed.
+    """
+    left = max(_MAX_INFLATED, _MAX_RATIO * file_bytes)
+    for block in blocks:
+        inflate = zlib.decompressobj()
+        with suppress(zlib.error):
+            while left > 0 and (piece := inflate.decompress(block, 1 << 20)):
+                left, block = left - len(piece), inflate.unconsumed_tail
+        if left <= 0:
+            must = f"one with at most {_MAX_RATIO} times its size of data, or {_MAX_INFLATED >> 20} MB"
+            raise InputError("file", must, Words("a file with more compressed data"))
+
+
+def build_read_error(path: Path, error: OSError) -> InputError:
+    """Return the error for an unreadable file, with similar names in its folder, such as an unfinished recording."""
+    names: list[str] = []
+    if isinstance(error, FileNotFoundError):
+        with contextlib.suppress(OSError):
+            names = sorted(each.name for each in path.parent.iterdir() if path.suffix in each.name)
+    names = [name for name in names if name.startswith(f"{path.stem}.")][:3] or find_similar(path.name, names)
+    such = f", such as {', '.join(str(path.with_name(name)) for name in names)}" if names else ""
+    return InputError("file", f"a file that can be read{such}", Words(f"{path} ({error.strerror})"))
+
+
+def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: bool) -> None:
+    """Raise an error early for a file that cannot be written.
+
+    Args:
+        path: The file.
+        field: Name of the option, for errors.
+        suffixes: Allowed suffixes.
+        force: Allow replacing an existing file.
+
+    Raises:
+        InputError: The suffix is wrong, the folder is missing or read-only, or the file exists.
+    """
+    if path.suffix not in suffixes:  # also of a path without a name, such as "" and /
+        *others, last = suffixes
+        endings = f"{', '.join(others)} or {last}" if others else last
+        raise InputError(field, f"a file name that ends in {endings}", str(path))
+    try:
+        path.with_name(path.name + PART_SUFFIX).exists()
+    except OSError as error:  # a name that is too long
+        raise InputError(field, "a file name that the system accepts", Words(f"{path} ({error.strerror})")) from None
+    if not path.parent.is_dir():
+        raise InputError(field, "in a folder that exists", str(path))
+    if path.is_dir():
+        raise InputError(field, "a file, not a folder", str(path))
+    if path.exists() and not force:
+        raise InputError(field, "a new file (--force replaces one)", Words(f"{path}, which exists"))
+    try:
+        # Permissions alone are not sufficient: try it.
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise InputError(field, "in a folder that can be written", Words(f"{path} ({error.strerror})")) from None
+
+
+def check_output_differs(sources: list[Path], output: Path, *, field: str = "output") -> None:
+    """Raise an error for an output that is one of the sources, under any name.
+
+    Raises:
+        InputError: The output, or its temporary file, is one of the sources.
+    """
+    for candidate in (output, output.with_name(output.name + PART_SUFFIX)):
+        for source in sources:
+            with suppress(OSError):  # one of them does not exist
+                if source.samefile(candidate):
+                    raise InputError(field, "another file than those that are read", str(output))
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary file that replaces `path` if the block succeeds, and is removed otherwise.
+
+    A symbolic link at `path` is replaced, not followed. A killed process leaves the temporary file, whose name begins
+    with a dot.
+
+    Raises:
+        DiskError: The disk refused, whatever error the writing library raised.
+    """
+    draft = path.with_name(f".{path.name[:_MAX_NAME]}.{secrets.token_hex(8)}{PART_SUFFIX}")
+    try:
+        os.close(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        yield draft
+        draft.replace(path)
+    except (InputError, SimulationError, DiskError):
+        raise
+    except (OSError, RuntimeError, ValueError) as error:  # errors of writing libraries; any other is a bug
+        # A library that closes after a failure may fail again: the system's first error is reported.
+        reason, cause = str(error) or type(error).__name__, error
+        while cause is not None:
+            reason = (isinstance(cause, OSError) and cause.strerror) or reason
+            cause = cause.__context__
+        raise DiskError(f"{path} could not be written: {reason}; nothing of it is kept") from error
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
+
+
+def write_file(path: Path, data: str | bytes) -> None:
+    """Write a file at once, text in UTF-8.
+
+    Raises:
+        DiskError: The disk refused; an existing file stays unchanged.
+    """
+    with whole_file(path) as draft:
+        draft.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def open_output(path: Path, mode: str) -> IO[Any]:
+    """Open a file that others may read while it is written: a log, a journal; a symbolic link is refused.
+
+    Args:
+        path: The file.
+        mode: Mode of `open`; text is UTF-8.
+
+    Raises:
+        OSError: The file cannot be written, or is a symbolic link.
+    """
+    encoding = None if "b" in mode else "utf-8"
+    return open(path, mode, encoding=encoding, opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW, 0o666))
+
+
+class Closing(ABC):
+    """An object whose `close` is called at the end of a `with`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release all resources."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
