@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import re
 import shutil
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from replays.campaigns.equipment.bench import Bench, BenchSettings, LateRigError, Target
-from replays.campaigns.equipment.device import Device
+from replays.campaigns.equipment.device import Device, hash_files
 from replays.campaigns.measurement import Measurement
 from rig.base.errors import DiskError, InputError
 from rig.base.outcome import InconclusiveError, Outcome
@@ -53,9 +52,9 @@ class Trial:
         measurements: Judged values, in order.
         kept: Files of the evidence.
         floor_ms: Median and maximum round-trip time of a rig in real time [ms].
-        file: File of the test, for its digest.
+        file: File of the test, for its digest, which is computed at the start.
         keeps_all: Whether the evidence of a test that passes is kept too.
-        digests: SHA-256 of the test's file, the programs of its devices, and its recording, by name.
+        digests: SHA-256 of the test's file, the programs of its devices before their start, and its recording, by name.
     """
 
     id: str
@@ -79,6 +78,7 @@ class Trial:
 
     def __post_init__(self) -> None:
         self._folder_entry = self.folder.lstat()
+        self.digests |= hash_files(() if self.file is None else [self.file])
 
     def has_folder(self) -> bool:
         """Return whether the folder of the devices was neither removed nor replaced."""
@@ -126,6 +126,7 @@ class Trial:
             may_end=may_end,
         )  # fmt: skip
         self.devices.append(device)
+        self.digests |= device.digests
         device.joins = bench.pace == "lockstep" if joins is None else joins
         if device.joins:
             device.wait_until_joined()
@@ -186,10 +187,6 @@ class Trial:
                     self.recording = self.record.stop()
 
     def _clean_up(self, failed: bool) -> None:
-        for path in (self.file, *(file for device in self.devices for file in device.program_files)):
-            if path is not None:
-                with contextlib.suppress(OSError):  # removed during the test
-                    self.digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
         if self.record is not None and self.record.sha256:
             self.digests[f"recording of {self.id}"] = self.record.sha256
         if failed or self.keeps_all:

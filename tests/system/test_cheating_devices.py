@@ -7,6 +7,7 @@ is named by a function of `device.py`. The wall clock of all programs steps by a
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -137,6 +138,11 @@ def forges_evidence(machine):
     os.symlink("/etc/passwd", os.path.join(folder, "passwd"))
     os.truncate(os.open(os.path.join(folder, "large"), os.O_CREAT | os.O_RDWR), 1 << 28)
     return True
+def alters_program(machine):
+    machine.speed(0.0)
+    machine.note("trip", tags=["trip"])
+    with open(__file__, "a") as file:
+        file.write("# another program")
 def notes_only(machine):
     machine.note("trip", tags=["trip"])
     return True
@@ -149,7 +155,7 @@ def ignores_sigterm(): signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep
 EARLY = {starts_and_ends, never_joins, daemon, prints_much, swaps_part, links_part, truncates_part, alters_part,
          appends_to_part, removes_part, removes_records, hands_in_a_link, hands_in_a_folder_link, hands_in_a_pipe,
          hands_in_nothing, removes_folder, links_folder, fills_folder, locks_folder, stubborn_child}
-INSTEAD = {blind, forges_evidence}
+INSTEAD = {alters_program, blind, forges_evidence}
 LATE = {swaps_session, alters_session, ignores_sigterm}
 act = globals().get(how)
 if act in EARLY:
@@ -228,10 +234,12 @@ def test_python(bench, dut, how):
 """
 LOST = r"times that protection was lost (must be == 0; received 1 \()?it did not finish the block that ends at tick"
 REPLACED = "the recording was replaced or altered during the test: "
+ALTERED = r"changed program files of protection .*changed during the run: device\.py; output belongs in {folder}"
 NO_LINK = "without symbolic links"
 ENDED = "early ends of protection must be == 0; received 1 "
 QUICK = {
     "swaps_part": REPLACED + "another file",
+    "alters_program": ALTERED,
     "forges_evidence": "time to trip must be 0 to 20 ms; received nothing",
 }  # fmt: skip
 REASONS = {
@@ -285,7 +293,7 @@ PYTHON = {"leaves": ENDED}
 if CHOSEN:
     PYTHON |= {how: REASONS[how] for how in ("sound", "killed", "hangs", "raises", "exits_3", "vanishes", "swaps_part")}
     PYTHON |= {"leaves_allowed": "", "killed_by_test": ""}
-INCONCLUSIVE = {how for how, reason in REASONS.items() if reason.startswith(REPLACED)}
+INCONCLUSIVE = {how for how, reason in REASONS.items() if reason.startswith((REPLACED, ALTERED))}
 HOWS = {how: REASONS[how] for how in (QUICK if not CHOSEN else REASONS if CHOSEN == "all" else CHOSEN.split(","))}
 
 
@@ -365,3 +373,13 @@ def test_forged_evidence_is_kept_apart_and_not_shown(cases: dict[str, Any]) -> N
     (trouble,) = cases["forges_evidence"]["troubles"]
     assert re.match(r"files of devices that were not kept \(.*\): 2: large, passwd", trouble)
     assert "<script>forged" not in (folder / "index.html").read_text(encoding="utf-8")
+
+
+def test_an_altered_program_has_its_digests_of_before_and_after_the_run(cases: dict[str, Any]) -> None:
+    if "alters_program" not in cases:
+        pytest.skip("not chosen")
+    document = json.loads((cases["folder"] / "out/results.json").read_text(encoding="utf-8"))
+    (digests,) = (case["digests"] for name, case in document["wall"]["cases"].items() if "alters_program" in name)
+    after = (cases["folder"] / "device.py").read_bytes()
+    assert digests["device.py, after the run"] == hashlib.sha256(after).hexdigest()
+    assert digests["device.py"] == hashlib.sha256(after.removesuffix(b"# another program")).hexdigest()

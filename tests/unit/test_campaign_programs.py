@@ -56,7 +56,7 @@ def test_a_child_in_a_session_of_its_own_ends_with_its_program(tmp_path: Path, m
         program.kill()
     assert program.wait(60.0) == status
     program.end()
-    assert not is_running(int((tmp_path / "child").read_text()))
+    waiting.until(lambda: not is_running(int((tmp_path / "child").read_text())))
 
 
 def test_output_is_bounded_and_read_although_the_file_was_replaced(tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import re
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from replays.campaigns.equipment.bench import Bench, BenchError
@@ -55,9 +57,12 @@ class Device:
         check_program(words, where, field="command")
         self.name, self.log, self.folder, self.may_end, self.bench = name, log, files, may_end, bench
         program = shutil.which(words[0], path=str(Path(sys.executable).parent)) or shutil.which(words[0])
-        files_named = (where / word for word in words[:3])
-        self.program_files = [file for file in (*files_named, Path(program or words[0])) if file.is_file()]
-        """Program and script of the command line."""
+        script = next((where / word for word in words[1:3] if (where / word).is_file()), where / words[0])
+        self._program_files = [file for file in (where / words[0], script, Path(program or words[0])) if file.is_file()]
+        self.digests = hash_files(self._program_files)
+        """SHA-256 of the program and the script of the command line before the start, by name."""
+        self.changed_digests: dict[str, str] = {}
+        """SHA-256 after the run, or "removed", of those that changed during it, by name."""
         self.joins = True
         """Whether the rig waits for it in lockstep."""
         self.is_ended_by_test = self.was_lost = self.has_ended_early = False
@@ -70,11 +75,20 @@ class Device:
 
     def _note_loss(self) -> None:
         self.was_lost = self.rig_name in self.bench.lost
+        self._note_changes()
+
+    def _note_changes(self) -> None:
+        now = hash_files(self._program_files)
+        self.changed_digests = {
+            name: now.get(name, "removed") for name, digest in self.digests.items() if now.get(name) != digest
+        }
 
     def end(self) -> None:
         """End the program after the test, unless the test has ended it."""
         self.is_ended_by_test, self.program.is_ended = self.program.is_ended, True
         self.program.end()
+        if not self.is_ended_by_test:
+            self._note_changes()
 
     def wait_until_joined(self) -> None:
         """Wait until the device takes part in lockstep.
@@ -108,6 +122,15 @@ class Device:
         """
         if (status := self.program.status) is not None:
             raise BenchError(f"device {self.name} ended with status {status}: {self.program.last_line}")
+
+
+def hash_files(files: Iterable[Path]) -> dict[str, str]:
+    """Return the SHA-256 digests of files by name, without those that cannot be read."""
+    digests = {}
+    for file in files:
+        with contextlib.suppress(OSError):
+            digests[file.name] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return digests
 
 
 def fill_placeholders(text: str, places: Mapping[str, str], field: str, kept: Sequence[str] = ()) -> str:

@@ -182,6 +182,11 @@ def _measure_device(device: Device, results: CaseRecording, trial: Trial, lost: 
         note = "; ".join(reason for _, reason in losses)
         name = f"times that {device.name} was lost"
         trial.take(Measurement(name, float(len(losses)), Must("==", 0.0, "1"), note=note, at_s=at_s))
+    if device.changed_digests:
+        trial.digests |= {f"{name}, after the run": digest for name, digest in device.changed_digests.items()}
+        name, count = f"changed program files of {device.name}", float(len(device.changed_digests))
+        reason = f"changed during the run: {', '.join(device.changed_digests)}; output belongs in {{folder}}"
+        trial.take(Measurement(name, count, Must("==", 0.0, "1"), open_reason=reason))
     left_s = [at_s for at_s, state, _ in states if state == "left" and ends_s and at_s < ends_s[0]]
     if (left_s or device.has_ended_early) and not (device.may_end or device.is_ended_by_test):
         note = f"it {'left lockstep' if left_s else 'ended'} before the run; may_end = true allows it"
