@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import drivers.protection
 from replays.campaigns.files.campaign import find_shipped
+from tests.mutants import replace_once
 
 SOURCES = Path(drivers.protection.__file__).parent
 _DEVICE = "python -m drivers.protection"
@@ -190,8 +191,7 @@ def run(defect: Defect | None, campaign: str) -> tuple[int, str]:
         for source in SOURCES.glob("*.py"):
             text = source.read_text("utf-8")
             if defect is not None and source.name == defect.file:
-                assert text.count(defect.text) == 1, f"{defect.name}: {text.count(defect.text)} places"
-                text = text.replace(defect.text, defect.replacement)
+                text = replace_once(text, defect.text, defect.replacement, defect.name)
             (package / source.name).write_text(text.replace("drivers.protection", package.name), "utf-8")
         device = command.replace(_DEVICE, f"python -m {package.name}")
         paths = os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))

@@ -230,13 +230,26 @@ def _parses(text: str) -> bool:
     return True
 
 
+def replace_once(text: str, old: str, new: str, name: str) -> str:
+    """Return a source with a text replaced.
+
+    Raises:
+        ValueError: The text does not occur exactly once; the message has the name of the defect.
+    """
+    if text.count(old) != 1:
+        raise ValueError(f"{name}: the replaced text must occur once; received {text.count(old)} times: {old}")
+    return text.replace(old, new)
+
+
 def choose_mutants(count: int, seed: int) -> list[Mutant]:
     """Return `count` mutants: the picked ones, then equally many of each module, drawn at random."""
     found = []
     for file, old, new in PICKED_MUTANTS:
         text = (ROOT / file).read_text(encoding="utf-8")
-        if text.count(old) != 1:
-            print(f"a picked place must stand once in {file}; received {text.count(old)} times: {old}")
+        try:
+            replace_once(text, old, new, file)
+        except ValueError as error:
+            print(error)
             sys.exit(2)
         found.append(Mutant(file, text.index(old), text.index(old) + len(old), new, "picked"))
     draw, stacks = random.Random(seed), []

@@ -13,6 +13,7 @@ from typing import Any
 
 from drivers.protection import __main__ as runner
 from drivers.protection import monitor
+from tests.mutants import replace_once
 from tests.unit.protection_scenarios import SCENARIOS, sound
 
 
@@ -29,10 +30,10 @@ class Mutant:
     def device(self) -> Any:
         """Return the mutant as a device for a scenario."""
         assert self.source.__file__ is not None
-        text = Path(self.source.__file__).read_text(encoding="utf-8")
-        assert text.count(self.text) == 1, f"{self.name}: its text stands there {text.count(self.text)} times"
+        source = Path(self.source.__file__).read_text(encoding="utf-8")
+        text = replace_once(source, self.text, self.instead, self.name)
         module = ModuleType(self.source.__name__)
-        exec(compile(text.replace(self.text, self.instead), self.name, "exec"), module.__dict__)
+        exec(compile(text, self.name, "exec"), module.__dict__)
         members = {name: getattr(module, name) for name in vars(sound()) if hasattr(module, name)}
         return SimpleNamespace(**{**vars(sound()), **members})
 
@@ -167,7 +168,7 @@ MUTANTS = [
     ),
     Mutant(
         "delay of each block", "the_division_into_blocks_has_no_effect",
-        "-1 - self._runs.get(what, 0)", '-1 - self._runs.get(what, 0) * (what[0] == "ok")',
+        "-1 - self._runs.get(alarm, 0)", '-1 - self._runs.get(alarm, 0) * (alarm[0] == "ok")',
     ),
     Mutant(
         "window of each block", "the_division_into_blocks_has_no_effect",

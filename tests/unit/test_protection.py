@@ -26,6 +26,12 @@ def test_each_mutant_is_detected_by_its_scenario(mutant: Mutant) -> None:
     assert mutant.fails(mutant.told_by)
 
 
+@pytest.mark.parametrize("text", ["Protection", "no such text"])
+def test_a_mutant_whose_text_does_not_occur_once_is_an_error(text: str) -> None:
+    with pytest.raises(ValueError, match=r"a defect: the replaced text must occur once; received \d+ times"):
+        Mutant("a defect", "overspeed_trips", text, "").fails("overspeed_trips")
+
+
 def test_each_scenario_detects_a_mutant() -> None:
     assert {mutant.told_by for mutant in MUTANTS} == set(SCENARIOS)
 
