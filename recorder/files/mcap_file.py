@@ -16,7 +16,7 @@ from mcap.writer import Writer
 
 from recorder.files.chunks import CHUNK, RECORD
 from recorder.files.schemas import TEXT, Definition, wrap_text
-from recorder.files.unfinished_file import Draft
+from recorder.files.unfinished_file import ALTERED, Draft
 
 _CHUNK_BYTES = 1 << 20
 _CHUNK_LIST = "_Writer__chunk_indices"
@@ -113,8 +113,8 @@ class McapFile:
         self.draft.verify()
         try:
             self.mcap.finish()
-        except struct.error:  # the index is read from the file
-            raise OSError(errno.EIO, "the file was altered while it was being written") from None
+        except (struct.error, ValueError, OverflowError):  # the index is read from the file
+            raise OSError(errno.EIO, f"the file was altered {ALTERED}") from None
         self.size_bytes = self.draft.sync()
         self.draft.finish()
 
@@ -156,3 +156,5 @@ class _ChunkIndexes:
                     uncompressed_size=raw_size,
                 )
             position += whole
+        if position != os.fstat(number).st_size:
+            raise ValueError("a record beyond the end of the file")

@@ -16,6 +16,9 @@ from pathlib import Path
 from rig.base.errors import InputError, Words
 from rig.base.files import PART_SUFFIX, check_new_file, open_file
 
+ALTERED = "while it was being written"
+"""Words of each error of a file that another process removed, replaced or altered."""
+
 
 def get_part_path(path: Path) -> Path:
     """Return the name of a recording in progress."""
@@ -94,12 +97,15 @@ class Draft:
 
         check_destination(path, force=force)
         self.path, self.part = path, get_part_path(path)
-        self._force, self.digest = force, hashlib.sha256()
+        self._force, self.digest, self._size_bytes = force, hashlib.sha256(), 0
         try:
             if force and self.part.exists():
                 # Create a new file instead of truncating the old one, so that no other process has it open.
                 remove([self.part])
-            self.file = self.part.open("x+b")  # readable, so that it can be saved after a removal
+            # Readable, so that it can be saved after a removal. Appending, because a position after the end of a file
+            # that was truncated would hide that from a comparison of sizes.
+            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND
+            self.file = os.fdopen(os.open(self.part, flags, 0o666), "a+b")
             fcntl.flock(self.file, fcntl.LOCK_EX)
         except OSError as error:
             raise InputError("output", "a file that can be written", Words(f"{self.part} ({error.strerror})")) from None
@@ -107,11 +113,12 @@ class Draft:
     def write(self, data: bytes) -> int:
         """Append bytes to the file."""
         self.digest.update(data)
+        self._size_bytes += len(data)
         return self.file.write(data)
 
     def tell(self) -> int:
-        """Return the position in the file [bytes]."""
-        return self.file.tell()
+        """Return the number of bytes written, which the file does not have if another process truncated it."""
+        return self._size_bytes
 
     def flush(self) -> None:
         """Pass all written bytes to the operating system."""
@@ -121,15 +128,12 @@ class Draft:
         """Flush to the disk and return the file size [bytes].
 
         Raises:
-            OSError: The disk reports an error, or the file was removed; then it was copied, if possible, to the nearest
-                existing parent folder.
+            OSError: The disk reports an error, or another process changed the file; see `verify`.
         """
         self.file.flush()
         os.fsync(self.file.fileno())
-        # A removed file can still be written, but is lost when it is closed.
-        if not os.fstat(self.file.fileno()).st_nlink:
-            self._save("removed")
-        return self.file.tell()
+        self.verify()
+        return self.tell()
 
     def sync_folder(self) -> None:
         """Flush the folder entry to the disk, where the file system supports it."""
@@ -166,16 +170,25 @@ class Draft:
         self.file.close()
 
     def verify(self) -> None:
-        """Raise an OSError if the file was replaced, or has another size than was written; it is then copied."""
+        """Check that the file still has its name and the size that was written.
+
+        Raises:
+            OSError: If it was truncated or appended to; or removed or replaced, and then it was copied, if possible, to
+                its folder or the nearest existing parent.
+        """
         self.file.flush()
         if not self._is_at(self.part):
-            self._save("replaced")
+            entry = os.fstat(self.file.fileno())
+            if entry.st_nlink and entry.st_size != self.tell():
+                raise OSError(errno.EIO, f"{self.part} was truncated or appended to {ALTERED}")
+            # A removed file can still be written, but is lost when it is closed.
+            self._save("replaced" if entry.st_nlink else "removed")
 
     def _is_at(self, path: Path) -> bool:
         """Return whether a name leads to the open file, with the size that was written."""
         with contextlib.suppress(OSError):
             named = path.lstat()
-            return os.path.samestat(named, os.fstat(self.file.fileno())) and named.st_size == self.file.tell()
+            return os.path.samestat(named, os.fstat(self.file.fileno())) and named.st_size == self.tell()
         return False
 
     def _save(self, what: str) -> None:
@@ -191,4 +204,4 @@ class Draft:
                 while data := os.pread(self.file.fileno(), 1 << 20, position):
                     copy.write(data)
                     position += len(data)
-        raise OSError(errno.ENOENT, f"{part_path} was {what} while it was being written")
+        raise OSError(errno.ENOENT, f"{part_path} was {what} {ALTERED}")

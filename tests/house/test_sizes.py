@@ -22,12 +22,12 @@ SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
     "drivers": 709,
-    "drivers/can": 4517,
+    "drivers/can": 4524,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
     "drivers/protection": 362,
-    "drivers/sources": 984,
+    "drivers/sources": 994,
     "recorder": 1343,
     "recorder/contents": 1268,
     "recorder/files": 823,

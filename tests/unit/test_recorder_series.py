@@ -341,24 +341,46 @@ def test_a_removed_folder_leaves_a_copy_in_the_nearest_one(tmp_path, items):
     assert len(payloads) >= 24
 
 
-@pytest.mark.parametrize("how", ["copy", "link", "append"])
-def test_a_replaced_file_is_an_error_and_is_not_published(how, tmp_path, items):
+@pytest.mark.parametrize("size_bytes", [0, 5000, 10_000_000])
+def test_a_file_that_another_process_truncates_or_appends_to_ends_at_the_next_flush(tmp_path, items, size_bytes):
     file = series(tmp_path / "run.mcap")
     for key, payload in items[:200]:
         file.take(Payload.read(key, payload, 0))
-    if how == "append":
-        os.truncate(file.part, 10_000_000)
-    else:
-        other = tmp_path / "other"
-        other.write_bytes(b"old")
-        file.part.rename(tmp_path / "away")
-        file.part.hardlink_to(other) if how == "copy" else file.part.symlink_to(other)
-    with pytest.raises(RecordingError, match=r"was replaced .* are kept in .*run\.saved\.mcap"):
+    os.truncate(file.part, size_bytes)
+    with pytest.raises(RecordingError, match=r"\.part was truncated or appended to while it was being written"):
+        [file.take(Payload.read(*each, 0)) for each in items[200:]]  # not its end
+    assert [each.name for each in tmp_path.iterdir()] == ["run.mcap.part"]
+
+
+@pytest.mark.parametrize("length", [b"\xff" * 8, b"\xff" * 7 + b"\0", b"\1" + b"\0" * 7])
+def test_a_file_whose_index_cannot_be_read_at_the_end_is_an_error(tmp_path, items, length):
+    file = series(tmp_path / "run.mcap")
+    for key, payload in items[:200]:
+        file.take(Payload.read(key, payload, 0))
+    with file.part.open("r+b") as part:
+        part.seek(9)  # length of the first record
+        part.write(length)
+    with pytest.raises(RecordingError, match="the file was altered while it was being written"):
         file.finish("completed")
     assert not (tmp_path / "run.mcap").exists()
-    if how != "append":
-        saved = [payload for _, payload in Recording.open(tmp_path / "run.saved.mcap.part").payloads(PROBES)]
-        assert saved == [payload for key, payload in items[:200] if key == PROBES]
+
+
+@pytest.mark.parametrize("at_end", [True, False])
+@pytest.mark.parametrize("how", ["copy", "link"])
+def test_a_replaced_file_is_an_error_and_is_not_published(how, at_end, tmp_path, items):
+    file = series(tmp_path / "run.mcap")
+    for key, payload in items[:200]:
+        file.take(Payload.read(key, payload, 0))
+    other = tmp_path / "other"
+    other.write_bytes(b"old")
+    file.part.rename(tmp_path / "away")
+    file.part.hardlink_to(other) if how == "copy" else file.part.symlink_to(other)
+    with pytest.raises(RecordingError, match=r"was replaced .* are kept in .*run\.saved\.mcap"):
+        file.finish("completed") if at_end else [file.take(Payload.read(*each, 0)) for each in items[200:300]]
+    assert not (tmp_path / "run.mcap").exists()
+    saved = [payload for _, payload in Recording.open(tmp_path / "run.saved.mcap.part").payloads(PROBES)]
+    assert saved == [payload for key, payload in items if key == PROBES][: len(saved)]
+    assert len(saved) >= 24
 
 
 @pytest.mark.parametrize("moment", ["before", "during"])
