@@ -89,6 +89,7 @@ def swaps_part(): replace(recording())
 def links_part(): replace(recording(), with_link=True)
 def truncates_part(): os.truncate(recording(), 0)
 def alters_part(): write(b"\0" * 100, 5000)
+def alters_index(): write(b"\xff" * 8, 9)
 def appends_to_part(): write(b"\0" * 50_000_000)
 def removes_part(): os.unlink(recording())
 def removes_records(): shutil.rmtree(os.path.dirname(recording()))
@@ -154,8 +155,8 @@ def alters_session(): write(b"\0" * 100, 5000)
 def ignores_sigterm(): signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(600)
 
 EARLY = {starts_and_ends, never_joins, daemon, prints_much, swaps_part, links_part, truncates_part, alters_part,
-         appends_to_part, removes_part, removes_records, hands_in_a_link, hands_in_a_folder_link, hands_in_a_pipe,
-         hands_in_nothing, removes_folder, links_folder, fills_folder, locks_folder, stubborn_child}
+         alters_index, appends_to_part, removes_part, removes_records, hands_in_a_link, hands_in_a_folder_link,
+         hands_in_a_pipe, hands_in_nothing, removes_folder, links_folder, fills_folder, locks_folder, stubborn_child}
 INSTEAD = {alters_program, blind, forges_evidence}
 LATE = {swaps_session, alters_session, ignores_sigterm}
 act = globals().get(how)
@@ -241,6 +242,7 @@ ENDED = "early ends of protection must be == 0; received 1 "
 QUICK = {
     "swaps_part": REPLACED + "another file",
     "alters_program": ALTERED,
+    "alters_index": REPLACED + "it was truncated or appended to, or its records cannot be read",
     "forges_evidence": "time to trip must be 0 to 20 ms; received nothing",
 }  # fmt: skip
 REASONS = {

@@ -120,6 +120,8 @@ class Record:
         Raises:
             ReplacedRecordingError: If inode, size or digest differ.
         """
+        from recorder.files.unfinished_file import ALTERED
+
         opened = os.fstat(self._descriptor)
         wrong = ""
         try:
@@ -135,6 +137,8 @@ class Record:
                 position += len(data)
             if position != summary.size_bytes or digest.hexdigest() != summary.sha256:
                 wrong = f"its {position} bytes are not the {summary.size_bytes} bytes that were written"
+        elif not wrong and ALTERED in summary.error:
+            wrong = "it was truncated or appended to, or its records cannot be read"
         if wrong:
             raise ReplacedRecordingError(f"the recording was replaced or altered during the test: {wrong}")
 
