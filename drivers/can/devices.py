@@ -5,14 +5,15 @@ A node number represents the name: the rig calls device 7 of a bus "CAN 7".
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from drivers.can.faults import fit_number
+from drivers.can.faults import MAX_NUMBER, fit_number
 from drivers.can.message import KEY, CanMessage, CanSignal, checksum
 from rig.base.errors import InputError, UnknownNameError
 
@@ -203,6 +204,18 @@ def note_frame(
         message, kind=int(DeviceKind.NOTE), node=node, note=int(kind), alarm=int(alarm or 0),
         channel=0 if channel is None else numbers[channel], **raw,
     )  # fmt: skip
+
+
+def find_value(words: Sequence[str], names: Collection[str]) -> float | None:
+    """Return the number after the last kind or channel in a note, as in "danger disk_x 512 um"; None without one.
+
+    A number that does not fit the frame is left out, like all other words that the frame has no field for.
+    """
+    last = max((place for place, word in enumerate(words) if word in names), default=-1)
+    with contextlib.suppress(ValueError, IndexError):
+        value = float(words[last + 1])
+        return value if last >= 0 and abs(value) <= MAX_NUMBER else None
+    return None
 
 
 def sender_frame(message: CanMessage, node: int, command: bytes) -> tuple[int, bytes]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from enum import IntEnum
 from typing import Any
 
@@ -11,6 +10,9 @@ from rig.base.errors import InputError, UnknownNameError
 from rig.channels.faults import KINDS
 from rig.channels.table import ChannelTable
 from rig.run.commands.table import ClearCommand, FaultCommand
+
+MAX_NUMBER = 2047e7
+"""Largest value of `number` and `exponent`."""
 
 
 class FaultKind(IntEnum):
@@ -59,7 +61,7 @@ def fit_number(value: float, *, field: str) -> dict[str, int]:
     Raises:
         InputError: The value is too large for them, or not finite.
     """
-    fits = (e for e in range(-8, 8) if math.isfinite(value) and abs(round(value / 10.0**e)) <= 2047)
+    fits = (e for e in range(-8, 8) if abs(value) <= MAX_NUMBER and abs(round(value / 10.0**e)) <= 2047)
     exponent = next(fits, None)
     if exponent is None:
         raise InputError(field, "at most 2.047e10 in a CAN frame", value)

@@ -1,7 +1,7 @@
 """Client of a rig on a CAN bus: commands as acknowledged frames, and the rig's events as far as frames carry them.
 
 Requests for which the bus has no frame are refused here by name: truth tables, steps, and fault fields except the main
-one. A note is sent by a tag that is a kind of note, and its channel; the rig builds the text. A device under test is
+one. A note is sent by a tag that is a kind of note, channel and value; the rig builds the text. A device under test is
 identified by its node number.
 """
 
@@ -12,7 +12,16 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from drivers.can.devices import DeviceKind, DeviceState, NoteKind, device_frame, device_name, note_frame, sender_frame
+from drivers.can.devices import (
+    DeviceKind,
+    DeviceState,
+    NoteKind,
+    device_frame,
+    device_name,
+    find_value,
+    note_frame,
+    sender_frame,
+)
 from drivers.can.signals import (
     EVENT_VALUES,
     MAX_LEAD,
@@ -264,8 +273,9 @@ class CanClient(Closing):
         channel = next((word for word in words if word in self.source.channels.channels), None)
         alarm = next((kinds[word] for word in words if word in kinds and kinds[word] is not found[0]), None)
         ends = found[0] in (NoteKind.CLEAR, NoteKind.RESET)
-        message = self.source.table.by_name["Device"]
-        self.source.send(*note_frame(message, found[0], self.node, channel=channel, alarm=alarm if ends else None))
+        value = find_value(words, {*kinds, *self.source.channels.channels, *self.source.channels.groups})
+        message, alarm = self.source.table.by_name["Device"], alarm if ends else None
+        self.source.send(*note_frame(message, found[0], self.node, channel=channel, value=value, alarm=alarm))
         return {"accepted": True, "id": 0, "tick": self._tick, "time_s": self._tick * _US}
 
     def _device(self, kind: DeviceKind, fields: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:

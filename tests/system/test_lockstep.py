@@ -129,7 +129,7 @@ def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
                 device.note("over CAN", tags=["protection"])
             device.note("0.1 s  clear  danger disk_x  512", tags=["protection", "clear"])
             note = machine.event("note", timeout_s=PATIENCE_S)
-            assert (note["text"], note["tags"], note["from"]) == ("clear danger disk_x", ["clear"], "CAN 3")
+            assert (note["text"], note["tags"], note["from"]) == ("clear danger disk_x 512", ["clear"], "CAN 3")
             with pytest.raises(InputError, match="fault must be with only its main number"):
                 device.fault("P_E", "gain", factor=2.0, for_s=1.0)
             with pytest.raises(RefusedError, match="speed was refused over CAN: out of range"):

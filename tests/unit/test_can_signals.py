@@ -11,7 +11,7 @@ import pytest
 
 from drivers.can import analysis
 from drivers.can.bus.timing import speed
-from drivers.can.devices import DeviceKind, DeviceRequest, NoteKind, device_frame, note_frame, sender_frame
+from drivers.can.devices import DeviceKind, DeviceRequest, NoteKind, device_frame, find_value, note_frame, sender_frame
 from drivers.can.message import checksum, crc8
 from drivers.can.schedule import Schedule, schedule_from
 from drivers.can.signals import (
@@ -318,6 +318,25 @@ def test_a_note_of_a_device_has_its_tag_channel_and_value(kind: NoteKind, fields
     identifier, data = note_frame(TABLE.by_name["Device"], kind, 7, **fields)
     found = parse_command(identifier, data, 0)
     assert found == DeviceRequest(DeviceKind.NOTE, 7, {"text": text, "tags": [kind.tag]})
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0.123456 s  danger  disk_x  512.4", 512.4), ("rows-lost    5", 5.0), ("trip 0", 0.0),
+        ("danger probes -3 um", -3.0),
+        ("trip at 0.1 s", None), ("0.1", None), ("trip", None), ("trip nan", None), ("trip 1e300", None), ("", None),
+    ],
+)  # fmt: skip
+def test_the_value_of_a_note_is_the_number_after_its_kind_or_channel(text: str, value: float | None) -> None:
+    assert find_value(text.split(), {"danger", "rows-lost", "trip", "disk_x", "probes"}) == value
+    if value is not None:
+        note_frame(TABLE.by_name["Device"], NoteKind.DANGER, 7, value=value)
+
+
+def test_acknowledge_has_no_room_for_the_number_of_a_device() -> None:
+    """docs/lockstep.md says how to number the devices because of this."""
+    assert sum(signal.bits for signal in TABLE.by_name["Acknowledge"].signals) == 64
 
 
 def test_kinds_of_notes_keep_their_numbers() -> None:
