@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -377,9 +378,6 @@ def test_many_cases_need_a_confirmation(tmp_path: Path, capsys: pytest.CaptureFi
     assert (status, err) == (2, "rig: --yes must be given for more than 1,000 cases; received 1002 cases\n")
     status, _, err = run_captured(capsys, "campaign", file, "--repeat", 2)
     assert (status, err) == (2, "rig: --yes must be given for more than 1,000 cases; received 1002 cases\n")
-    status, _, err = run_captured(capsys, "campaign", "recorder-acceptance", "--repeat", 2)
-    assert status == 2
-    assert "--repeat must be left out, except for *.campaign.toml files; received 2 for" in err
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -462,12 +460,38 @@ def test_shipped_campaigns_are_listed_by_name_and_load(capsys: pytest.CaptureFix
         campaign_path("hamer")
 
 
-def test_the_cases_are_listed_with_their_number(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_cases_are_listed_with_their_number(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    loaded: list[Any] = []
+
+    def load(*arguments: Any, **settings: Any) -> Campaign:
+        loaded.append(arguments)
+        return load_campaign(*arguments, **settings)
+
+    monkeypatch.setattr("replays.campaigns.files.campaign.load_campaign", load)
     status, out, err = run_captured(capsys, "campaign", "hammer", "recorder-acceptance", "--list")
-    assert (status, err) == (0, "")
+    assert (status, err, len(loaded)) == (0, "", 1)
     assert "hammer.campaign.toml::speed_hz=5.2  0.6 s\nhammer.campaign.toml::speed_hz=6.2  0.6 s\n" in out
     assert "test_recorder_acceptance.py: tests of pytest" in " ".join(out.split())
-    assert "\n2 cases, about " in out
+    assert "\n2 cases, 1.2 s simulated\nestimate: 4 s of processor time (1.6 s for a case, 0.1 s for a" in out
+
+
+def test_the_estimate_of_a_list_counts_cases_simulated_time_blocks_and_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def show(more: str, *words: object) -> str:
+        file = tmp_path / "x.campaign.toml"
+        file.write_text(f"{HEAD}duration_s = 50.0\n{more}\n{PEAK}", encoding="utf-8")
+        status, out, _ = run_captured(capsys, "campaign", file, "--list", *words)
+        assert status == 0
+        return " ".join(out.split())
+
+    assert "1 cases, 50 s simulated estimate: 19 s of" in show("block_ms = 10.0")  # 1.6 + 5 + 12
+    assert "estimate: 127 s of" in show("block_ms = 1.0")
+    assert "of processor time for 3 runs (1.6 s" in (out := show("block_ms = 10.0", "--repeat", 3))
+    assert "estimate: 56 s of" in out
+    assert "1 cases, 50 s simulated, of these 50 s in real time estimate" in show('pace = "real-time"')
 
 
 MATRIX = """

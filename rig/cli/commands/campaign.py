@@ -7,7 +7,7 @@ import os
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,9 +17,12 @@ from rig.cli.options import Force
 from rig.cli.output.folder import check_folder
 from rig.cli.output.tables import echo, progress_bar
 
+if TYPE_CHECKING:
+    from replays.campaigns.files.campaign import Case
+
 _INTERRUPTED = 130
-_CASE_S, _BLOCK_S = 1.6, 2.4
-"""Processor time of a case, and of a second of 1 ms blocks, for estimates; measured with the monitor that ships [s]."""
+_CASE_S, _SIMULATED_S, _BLOCK_S = 1.6, 0.1, 0.0024
+"""Processor time of a case, of a simulated second and of a block, measured with the monitor that ships [s]."""
 _EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
 
 
@@ -101,9 +104,9 @@ def campaign(
         parse_identity(identity or [])
         for file in sheet:
             check_sheet(file)
-    files = _check_files(files, against or (), replay, device, limit or (), repeat, yes=yes or list_cases)
+    files, cases = _check_files(files, against or (), replay, device, limit or (), repeat, yes=yes or list_cases)
     if list_cases:
-        _list_cases(files, device, limit or ())
+        _list_cases(files, cases, repeat)
         return
     plugin_options = {"--rig-results": output, "--rig-url": url, "--rig-replay": replay, "--rig-device": device}
     options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
@@ -129,21 +132,24 @@ def _list() -> None:
     echo(f"files in {FOLDER}")
 
 
-def _list_cases(files: list[str], device: str | None, limits: Sequence[str]) -> None:
+def _list_cases(files: list[str], cases: Sequence[Case], repeat: int) -> None:
     """Print the cases of campaign files, with an estimate of their time."""
-    from replays.campaigns.files.campaign import SUFFIX, load_campaign
+    from replays.campaigns.files.campaign import SUFFIX
 
-    count, processor_s = 0, 0.0
-    for file in files:
-        name, _, chosen = file.partition("::")
+    for name in (file.partition("::")[0] for file in files):
         if not name.endswith(SUFFIX):
             echo(f"{name}: tests of pytest; list them by pytest --collect-only")
-            continue
-        for case in load_campaign(Path(name), device, limits).cases:
-            if chosen in ("", case.id):
-                echo(f"{Path(name).name}::{case.id}  {case.duration_s:g} s")
-                count, processor_s = count + 1, processor_s + _CASE_S + _BLOCK_S * case.duration_s / case.bench.block_ms
-    echo(f"{count} cases, about {processor_s:.0f} s of processor time")
+    for case in cases:
+        echo(f"{case.file.name}::{case.id}  {case.duration_s:g} s")
+    simulated_s = sum(case.duration_s for case in cases)
+    real_s = sum(case.duration_s for case in cases if case.bench.pace == "real-time")
+    blocks = sum(1e3 * case.duration_s / case.bench.block_ms for case in cases)
+    processor_s = repeat * (_CASE_S * len(cases) + _SIMULATED_S * simulated_s + _BLOCK_S * blocks)
+    echo(f"{len(cases)} cases, {simulated_s:g} s simulated{f', of these {real_s:g} s in real time' if real_s else ''}")
+    echo(
+        f"estimate: {processor_s:.0f} s of processor time{f' for {repeat} runs' if repeat > 1 else ''} "
+        f"({_CASE_S:g} s for a case, {_SIMULATED_S:g} s for a simulated second, {1e3 * _BLOCK_S:g} ms for a block)"
+    )
 
 
 def _check_files(
@@ -155,8 +161,8 @@ def _check_files(
     repeat: int,
     *,
     yes: bool,
-) -> list[str]:
-    """Return the paths of the files; raise an error for wrong files before anything runs."""
+) -> tuple[list[str], list[Case]]:
+    """Return the paths and the cases of the files; raise an error for wrong files before anything runs."""
     from replays.campaigns.files.campaign import (
         MAX_CASES,
         MAX_UNCONFIRMED_CASES,
@@ -166,23 +172,22 @@ def _check_files(
     )  # fmt: skip
     from replays.campaigns.reporting.results import load_results
 
-    paths, count = [], 0
+    paths, cases = [], []
     for file in files:
         name, colons, case = file.partition("::")
         name = str(campaign_path(name))
         paths.append(f"{name}{colons}{case}")
         if name.endswith(SUFFIX):
             max_cases = MAX_CASES if yes or colons else MAX_UNCONFIRMED_CASES
-            known = [each.id for each in load_campaign(Path(name), device, limits, max_cases=max_cases).cases]
+            known = {each.id: each for each in load_campaign(Path(name), device, limits, max_cases=max_cases).cases}
             if colons and case not in known:
                 raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
-            count += repeat * (1 if colons else len(known))
+            cases += [known[case]] if colons else known.values()
         elif not Path(name).exists():
             raise InputError("FILE", f"a *{SUFFIX} file, or tests of pytest, that exists", name)
         elif Path(name).is_file() and not name.endswith(".py"):
             raise InputError("FILE", f"a file that ends in {SUFFIX} or .py, or a folder", name)
-        elif repeat > 1:
-            raise InputError("--repeat", f"left out, except for *{SUFFIX} files", Words(f"{repeat} for {name}"))
+    count = repeat * len(cases)
     if count > MAX_UNCONFIRMED_CASES and not yes:
         raise InputError("--yes", f"given for more than {MAX_UNCONFIRMED_CASES:,} cases", Words(f"{count} cases"))
     for each in against:
@@ -191,7 +196,7 @@ def _check_files(
         from replays.campaigns.equipment.bench import validate_replay
 
         validate_replay(replay)
-    return paths
+    return paths, cases
 
 
 def _run(files: list[str], options: list[str], output: Path | None) -> int:
