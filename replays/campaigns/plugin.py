@@ -25,6 +25,8 @@ _NODE_ID_FIELD = "_nodeid"
 """Field of a test's name, for which pytest has no public one."""
 _TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
 _FAILED = pytest.StashKey[bool]()
+_RUNS: pytest.StashKey[list[dict[str, list[str]]]] = pytest.StashKey()
+"""Findings of the finished runs of a test in Python that is repeated; only its last run is reported."""
 _MARKER = (
     'bench(scene="stable-run", pace="lockstep", block_ms=10, set={}, channels=[], faults=[], commands=[], '
     "duration_s=None, can=False, wait={}): the rig that a test is run on"
@@ -147,15 +149,59 @@ class CampaignItem(pytest.Item):
         return self.path, None, f"{self.case.title}: {self.name}"
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> None:
+    """Run a test in Python with a rig several times before the run that pytest reports."""
+    from replays.campaigns.reporting.results import find_reason
+
+    if isinstance(item, CampaignItem) or "rig_trial" not in getattr(item, "fixturenames", ()):
+        return
+    runner: Any = item.config.pluginmanager.getplugin("runner")
+    for number in range(1, item.config.option.rig_repeat):
+        runs = item.stash.setdefault(_RUNS, [])
+        # The parent as the next item ends the fixtures of this run only.
+        reports = runner.runtestprotocol(item, log=False, nextitem=item.parent)
+        if len(runs) < number:  # its setup failed, or it was skipped
+            runs.append({"error": [find_reason(each) for each in reports if not each.passed]})
+        item.stash[_FAILED] = False
+        if _TRIAL in item.stash:
+            del item.stash[_TRIAL]
+        item.user_properties.clear()
+
+
+def _is_reported(item: pytest.Item) -> bool:
+    """Return whether the current run of a test is the one that is reported."""
+    return len(item.stash.get(_RUNS, ())) >= item.config.option.rig_repeat - 1 or isinstance(item, CampaignItem)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
     """Raise the outcome of a trial's measurements after its test has ended without an error of its own."""
-    result = yield
-    if (trial := item.stash.get(_TRIAL, None)) is not None:
-        if trial.devices and not isinstance(item, CampaignItem):
+    trial, result, error = item.stash.get(_TRIAL, None), None, None
+    try:
+        result = yield
+        if trial is not None and trial.devices and not isinstance(item, CampaignItem):
             _judge_devices(item, trial)
+    except (Exception, pytest.fail.Exception) as caught:
+        if _RUNS not in item.stash:
+            raise
+        error = caught
+    if trial is not None:
+        if _RUNS in item.stash:
+            _compare_runs(item, trial, error)
         trial.raise_outcome()
     return result
+
+
+def _compare_runs(item: pytest.Item, trial: Trial, error: BaseException | None) -> None:
+    """Add the findings of a run, and compare all runs after the last one."""
+    from replays.campaigns.files.run import compare_runs, list_findings
+
+    is_last = _is_reported(item)
+    item.stash[_RUNS].append(list_findings(trial, error))
+    if is_last:
+        compare_runs(trial, item.stash[_RUNS], error)
+        item.user_properties.extend(trial.measurements[-1].properties())
 
 
 def _judge_devices(item: pytest.Item, trial: Trial) -> None:
@@ -211,9 +257,10 @@ def _get_trial(item: pytest.Item) -> Trial:
 def rig_trial(request: pytest.FixtureRequest) -> Iterator[Trial]:
     """Provide the state that the other fixtures share; end all processes afterwards."""
     item = request.node
-    trial = item.stash[_TRIAL] = _get_trial(item)
+    trial, is_reported = _get_trial(item), _is_reported(item)
+    item.stash[_TRIAL], trial.keeps_all = trial, trial.keeps_all and is_reported
     yield trial
-    trial.close(failed=item.stash.get(_FAILED, False))
+    trial.close(failed=item.stash.get(_FAILED, False) and is_reported)
 
 
 @pytest.fixture

@@ -127,6 +127,64 @@ def run_campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[
     return out, document
 
 
+REPEATED = """
+from pathlib import Path
+
+import pytest
+
+def count_runs():
+    with Path("runs").open("a") as file:
+        file.write("x")
+    return len(Path("runs").read_text())
+
+@pytest.fixture
+def number(measure):
+    Path("runs").write_text("") if Path("runs").exists() and len(Path("runs").read_text()) == 3 else None
+    yield count_runs()
+
+def test_same(number, measure):
+    measure("time", 3.0, "ms", "<=", 10.0)
+
+def test_other_value(number, measure):
+    measure("time", 30.0 if number == 2 else 3.0, "ms", "<=", 10.0)
+
+def test_fails(number, measure):
+    measure("time", 30.0, "ms", "<=", 10.0)
+
+def test_error(number, measure):
+    measure("time", 3.0, "ms", "<=", 10.0)
+    assert number != 3, "in the last run"
+
+def test_same_error(number, measure):
+    assert not number, f"in run {number}"
+
+@pytest.fixture
+def rare(number):
+    assert number != 1
+
+def test_setup(rare, measure):
+    measure("time", 3.0, "ms", "<=", 10.0)
+"""
+
+
+def test_a_test_in_python_is_repeated_and_its_runs_are_compared(folder: Path) -> None:
+    (folder / "test_x.py").write_text(REPEATED, encoding="utf-8")
+    _, document = run_campaign(folder, "test_x.py", "--repeat", "3", status=1)
+    found = {case["id"].partition("::test_")[2]: case for case in document["cases"]}
+    assert {name: case["outcome"] for name, case in found.items()} == {
+        "same": "passed", "other_value": "inconclusive", "fails": "failed", "error": "inconclusive",
+        "same_error": "failed", "setup": "inconclusive",
+    }  # fmt: skip
+    notes = {name: case["measurements"][-1]["note"] for name, case in found.items() if case["measurements"]}
+    assert notes == {
+        "same": "3 of 3 alike", "other_value": "2 of 3 alike: run 2: time is fail, not pass", "fails": "3 of 3 alike",
+        "error": "2 of 3 alike: run 3: error is AssertionError, not missing",
+        "setup": notes["setup"],
+    }  # fmt: skip
+    assert notes["setup"].startswith("1 of 3 alike: run 2: error is missing, not ")
+    assert "in run 3" in found["same_error"]["reason"]
+
+
 def test_a_device_in_lockstep_gets_the_same_verdict_each_time(folder: Path) -> None:
     out, both = run_campaign(folder, "x.campaign.toml", "test_x.py", status=1)
     well, dies, again, fixtures, behind = both["cases"]

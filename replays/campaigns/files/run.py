@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from replays.campaigns.equipment.bench import BenchError, UnsupportedError
 from replays.campaigns.equipment.cleanup import KILLED
-from replays.campaigns.evidence import MAX_FILES
+from replays.campaigns.evidence import MAX_FILES, MeasurementError
 from replays.campaigns.files.case_results import CaseRecording
 from replays.campaigns.files.expectation import expected_events
 from replays.campaigns.measurement import Measurement, Must, with_unit
@@ -212,41 +212,59 @@ def run_repeatedly(case: Case, trial: Trial, count: int, new_trial: Callable[[],
         return
     runs: list[dict[str, list[str]]] = []
     errors: list[Exception] = []
+    error: Exception | None
     for number in range(count):
-        current, error = trial if number == 0 else new_trial(), ""
+        current, error = trial if number == 0 else new_trial(), None
         try:
             run_case(case, current)
         except (BenchError, ConnectionError, TimeoutError) as caught:
             errors.append(caught)
-            error = current.mask_addresses(str(caught))
+            error = caught
         finally:
             if current is not trial:
                 current.close(failed=False)
-        runs.append({**({"error": [error]} if error else {}), **_list_findings(current)})
+        runs.append(list_findings(current, error))
+    compare_runs(trial, runs, errors[0] if errors else None)
+
+
+def compare_runs(trial: Trial, runs: Sequence[Mapping[str, list[str]]], error: BaseException | None) -> None:
+    """Make measurements of a trial inconclusive that differ between its runs, and add the number of runs alike.
+
+    Args:
+        trial: Trial of one of the runs.
+        runs: Findings of each run, see `list_findings`.
+        error: Error of a run, raised if all runs are alike.
+    """
     differences = {
         name: f"run {number}: {name} is {_show(run, name)}, not {_show(runs[0], name)}"
         for number, run in reversed(list(enumerate(runs[1:], 2)))
         for name in {**runs[0], **run} if run.get(name) != runs[0].get(name)
     }  # fmt: skip
-    if errors and not differences:
-        raise errors[0]
+    if error is not None and not differences and not isinstance(error, MeasurementError):
+        raise error
     trial.measurements[:] = [
         replace(each, open_reason=each.open_reason or differences.get(each.name, "")) for each in trial.measurements
     ]
-    alike, reason = runs.count(runs[0]), "; ".join(list(differences.values())[:_MAX_DIFFERENCES])
+    alike, count, reason = runs.count(runs[0]), len(runs), "; ".join(list(differences.values())[:_MAX_DIFFERENCES])
     must, note = Must("==", float(count), "1"), f"{alike} of {count} alike"
     trial.take(Measurement(REPETITION_NAME, float(alike), must, note=note, open_reason=reason and f"{note}: {reason}"))
 
 
-def _list_findings(trial: Trial) -> dict[str, list[str]]:
-    """Return verdicts and, in lockstep, values by the name of the measurement."""
+def list_findings(trial: Trial, error: BaseException | None = None) -> dict[str, list[str]]:
+    """Return verdicts and, in lockstep, values by the name of the measurement, and the error that ended the run.
+
+    An error of the test itself is listed by its type, as its text may have names and values of the run.
+    """
     in_lockstep = trial.bench is not None and trial.bench.pace == "lockstep"
     found: dict[str, list[str]] = {}
+    if error is not None and not isinstance(error, MeasurementError):
+        is_of_bench = isinstance(error, BenchError | ConnectionError | TimeoutError)
+        found["error"] = [trial.mask_addresses(str(error)) if is_of_bench else type(error).__name__]
     for each in trial.measurements:
         value = f"{with_unit(repr(each.value), each.must.unit)}, " if in_lockstep else ""
         found.setdefault(each.name, []).append(f"{value}{each.outcome.value}")
     return found
 
 
-def _show(run: dict[str, list[str]], name: str) -> str:
+def _show(run: Mapping[str, list[str]], name: str) -> str:
     return " and ".join(run.get(name, ["missing"]))
