@@ -96,7 +96,11 @@ GROUPS = {
         "dbc": "Show the DBC of the rig's messages",
         "load": "Show period and bus load of every message of the rig",
     },
-    "keys": {"init": "Create the certificates for an exposed rig"},
+    "keys": {
+        "init": "Create the certificates for an exposed rig",
+        "add": "Add the certificate of one device, which is bound to its name",
+        "remove": "Withdraw the certificate of a device or a role",
+    },
 }
 """Subcommands by group. Without a subcommand, the function of the group's own name runs."""
 
@@ -105,7 +109,7 @@ NEED_FULL = (
     "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
     "score", "campaign", "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
 )  # fmt: skip
-"""Commands that a lean install lacks; of `keys` it has `init`."""
+"""Commands that a lean install lacks; of `keys` it has the subcommands."""
 
 
 def rig() -> Group:

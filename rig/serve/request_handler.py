@@ -132,7 +132,7 @@ class PendingCommand:
         command: Its name.
         request: Its fields as received, within the size limit of documents.
         arguments: The validated fields, for commands in `REQUESTS`.
-        sender: Name that the sender gives itself.
+        sender: Name in the sender's certificate; without one, the name that the sender gives itself.
         reply: Receives the payload of the reply.
     """
 
@@ -196,15 +196,16 @@ class RequestHandler:
         self._server.on_failure(self.record_failure)
         for key, build in documents.items():
             self._server.answer(key, lambda _, build=build: wire.encode_document(build()))
-        self._server.answer_all(wire.command_key("*"), self._on_command)
+        for keys in ("*", "*/*"):  # the second: commands of devices with a certificate of their own
+            self._server.answer_all(wire.command_key(keys), self._on_command)
         self._server.subscribe_reports(f"{wire.CLIENTS}/*", self.clients.take)
         self._server.announce()
 
     def _on_command(self, key: str, payload: bytes) -> bytes | Future[bytes]:
         """Queue a command for the run's thread, which answers it, at the latest when the run ends."""
-        name = key.removeprefix(wire.command_key(""))
+        name, _, device = key.removeprefix(wire.command_key("")).partition("/")
         try:
-            pending = self._parse(name, payload)
+            pending = self._parse(name, payload, device)
             if not self._pending.offer(pending):
                 if self._end_reason:
                     raise InputError(name, f"sent while {self._running}", self._end_reason)
@@ -214,20 +215,25 @@ class RequestHandler:
         self._wake()
         return pending.reply
 
-    def _parse(self, name: str, payload: bytes) -> PendingCommand:
+    def _parse(self, name: str, payload: bytes, device: str) -> PendingCommand:
+        """Return a checked command; `device` is the name in the sender's certificate, empty without one."""
         if name in self._unsupported:
             raise RefusedError(self._unsupported[name])
         if name not in self._commands:
             raise InputError("command", f"one of {', '.join(self._commands)}", name)
         request = read_json(payload, field=name, most_bytes=REQUEST_BYTES)
-        origin = check(_Origin, {name: request.pop(name) for name in ("from", "rig") if name in request}, field="")
+        fields = {name: request.pop(name) for name in ("from", "rig") if name in request}
+        origin = check(_Origin, fields | ({"from": device} if device else {}), field="")
         if origin.rig is not None and origin.rig not in self._server.identities:
             raise RefusedError(f"{name} was sent to another rig, which ran here before: connect again")
         sender = origin.sender
         if name not in ("step", "done", "stop"):
             self._limit.check(sender)
         model = REQUESTS.get(name)
-        return PendingCommand(name, request, None if model is None else check(model, request, field=name), sender)
+        arguments = None if model is None else check(model, request, field=name)
+        if device and (named := getattr(arguments, "device", device)) != device:
+            raise InputError(f"{name}.device", f"{device}, the name in the certificate", named)
+        return PendingCommand(name, request, arguments, sender)
 
     def take_commands(self) -> Iterator[PendingCommand]:
         """Yield the received commands, oldest first, up to the limit per block."""

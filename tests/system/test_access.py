@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,11 @@ from cryptography import x509  # noqa: TID253
 from cryptography.hazmat.primitives.asymmetric import ec  # noqa: TID253
 from cryptography.x509.oid import ExtendedKeyUsageOID as Usage  # noqa: TID253
 
+from drivers.console import Console
 from rig.base.errors import InputError
+from rig.serve.request_handler import RequestHandler
 from rig.serve.transport import NoReplyError
+from rig.serve.transport.clients import Reporter
 from rig.serve.transport.exposure.access import (
     PERMISSIONS,
     PLAIN,
@@ -36,9 +40,12 @@ from rig.serve.transport.exposure.access import (
 from rig.serve.transport.exposure.certificates import (
     SIGNER,
     CertificateIssuer,
+    Holder,
+    add_device,
     build_subject,
     create_keys,
     read_holder,
+    remove_holder,
     write_holder,
 )
 from rig.serve.transport.zenoh import Exposure, ZenohClient, ZenohServer
@@ -339,6 +346,114 @@ def test_clients_report_the_reason_of_a_refusal(folders: Path) -> None:
     for folder in ("server", "expired", "nowhere"):
         with pytest.raises(InputError, match=r"^--tls must be a"):
             ZenohClient(exposed, tls=folders / folder)
+
+
+@contextmanager
+def serve_commands(endpoint: str, keys: Path) -> Iterator[RequestHandler]:
+    """Serve a rig at an exposed address that accepts notes and joins, and replies with the name of the sender."""
+    with ZenohServer(free_endpoint(), exposed=Exposure(endpoint, read_holder(keys, server=True))) as server:
+
+        def accept() -> None:
+            for pending in handler.take_commands():
+                pending.answer({"accepted": True, "id": 1, "tick": 0, "time_s": 0.0, "sender": pending.sender})
+
+        commands = ("note", "join")
+        handler = RequestHandler(
+            server, commands=commands, unsupported={}, running="it runs", wake=accept, on_warning=print
+        )
+        handler.open({"rig/status": lambda: {"state": "running"}})
+        yield handler
+
+
+def ask(session: zenoh.Session, command: str, **fields: Any) -> dict[str, Any] | None:
+    replies = session.get(f"rig/command/{command}", payload=json.dumps(fields), timeout=5.0)
+    return next((json.loads(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None), None)
+
+
+def test_a_device_cannot_use_the_name_of_another(tmp_path: Path) -> None:
+    keys, exposed = tmp_path / "keys", free_endpoint()
+    create_keys(keys, keep_authority=True)
+    for name in ("daq1", "guard"):
+        add_device(keys, name, "operator")
+    with serve_commands(exposed, keys) as handler, open_hostile_session(f"tls/{exposed}", folder=keys / "daq1") as daq1:
+        until(lambda: ask(daq1, "note/daq1", text="a") is not None)
+        for command in ("note", "note/guard", "note/*", "*/guard", "note/daq", "note/daq10"):
+            assert ask(daq1, command, text="a") is None, command
+        assert ask(daq1, "note/daq1", text="a", **{"from": "guard"}) == {
+            "accepted": True, "id": 1, "tick": 0, "time_s": 0.0, "sender": "daq1",
+        }  # fmt: skip
+        refused = ask(daq1, "join/daq1", device="guard")
+        assert refused is not None
+        assert refused["error"] == "join.device must be daq1, the name in the certificate; received 'guard'"
+        report = b'{"name": "guard", "received_index": 5}'
+        for name in ("guard", "daq1", "daq10", "daq1"):
+            daq1.put(f"rig/clients/{name}", report, congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: bool(handler.clients.rows(5, 1.0)))
+        assert set(handler.clients.rows(5, 1.0)) == {"daq1"}
+        # Our own client needs no settings: the rig names it as its certificate does.
+        with ZenohClient(exposed, tls=keys / "guard") as guard:
+            assert Console(guard, name="daq1", any_rig=True)._request("note", text="a")["sender"] == "guard"  # noqa: SLF001
+            Reporter(guard, "a recorder").send(4, lost=0)
+            until(lambda: set(handler.clients.rows(5, 1.0)) == {"daq1", "guard"})
+        # A role that several clients share is not bound to a name, and cannot use the keys of a device.
+        with open_hostile_session(f"tls/{exposed}", folder=keys / "operator") as shared:
+            until(lambda: ask(shared, "note", text="a") is not None)
+            assert ask(shared, "note/guard", text="a") is None
+
+
+def test_a_withdrawn_certificate_is_denied_everything(tmp_path: Path) -> None:
+    keys, old, exposed = tmp_path / "keys", tmp_path / "old", free_endpoint()
+    create_keys(keys, keep_authority=True)
+    add_device(keys, "daq1", "operator")
+    add_device(keys, "daq2", "operator")
+    authority = (keys / "server" / "authority.pem").read_bytes()
+    shutil.copytree(keys / "daq1", old)
+    remove_holder(keys, "daq1")
+    remove_holder(keys, "operator")
+    assert not (keys / "daq1").exists()
+    add_device(keys, "daq1", "operator")  # a certificate of the same name does not admit the earlier one
+    assert (keys / "daq1" / "authority.pem").read_bytes() == authority, "the others keep their certificates"
+    with serve_commands(exposed, keys):
+        for name in ("daq1", "daq2"):
+            with ZenohClient(exposed, tls=keys / name) as client:
+                assert client.request("rig/status") == b'{"state":"running"}'
+        with (
+            ZenohClient(exposed, tls=old) as client,
+            pytest.raises(NoReplyError, match=r"allows nothing to operator@daq1\.[0-9a-f]{8}: its certificate was"),
+        ):
+            client.request("rig/status", timeout_s=0.5)
+        with open_hostile_session(f"tls/{exposed}", folder=old) as session:
+            for command in ("note", "note/daq1", "note/daq2"):
+                assert ask(session, command, text="a") is None
+
+
+def test_the_expiry_of_a_certificate_is_named(folders: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exposed, signing = free_endpoint(), ec.generate_private_key(ec.SECP256R1())
+    issue, late = CertificateIssuer(signing, timedelta(days=1)), CertificateIssuer(signing, timedelta(minutes=-1))
+    authority, expired = issue.certificate(SIGNER, signing, None, []), datetime.now(UTC) - timedelta(minutes=1)
+    for holder, by, usage in (("server", late, Usage.SERVER_AUTH), ("viewer", issue, Usage.CLIENT_AUTH)):
+        key = ec.generate_private_key(ec.SECP256R1())
+        certificate = by.certificate(holder, key, usage, [build_subject("127.0.0.1")])
+        write_holder(tmp_path / holder, authority, certificate, key)
+    when = r"expired on \d{4}-\d\d-\d\d \d\d:\d\d UTC"
+    # A rig and a client refuse their own; a client names that of the rig.
+    for folder, is_server in ((tmp_path, True), (folders / "expired", False)):
+        with pytest.raises(InputError, match=rf"^--tls must be a certificate that is valid .*, {when}$"):
+            read_holder(folder, server=is_server)
+    holder = Holder(tmp_path / "server", "the rig", expired, ("viewer",))
+    with (
+        ZenohServer(free_endpoint(), exposed=Exposure(exposed, holder)),
+        pytest.raises(NoReplyError, match=rf"refuses this client as viewer, .*: the rig's certificate {when}$"),
+    ):
+        ZenohClient(exposed, wait_s=0.2, tls=tmp_path / "viewer")
+    # A certificate that expires later: the rig has closed the link.
+    with serve_commands(exposed, folders):
+        client = ZenohClient(exposed, tls=folders / "viewer")
+        assert client.request("rig/status") == b'{"state":"running"}'
+    with client, monkeypatch.context() as patched:
+        patched.setattr(client, "_holder", Holder(folders / "viewer", "viewer", expired, ()))
+        with pytest.raises(NoReplyError, match=rf"refuses the certificate in .*viewer, {when}$"):
+            client.request("rig/status", timeout_s=0.2)
 
 
 def test_an_exposed_rig_limits_links_and_message_size(folders: Path) -> None:

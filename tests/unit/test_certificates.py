@@ -14,8 +14,15 @@ from drivers.sources import open_source
 from rig.base.errors import InputError
 from rig.cli.connections.connection import Serving, print_addresses
 from rig.cli.main import main
-from rig.serve.transport.exposure.access import ROLES
-from rig.serve.transport.exposure.certificates import HOLDERS, SERVER, create_keys, read_holder
+from rig.serve.transport.exposure.access import ROLE_NAMES, ROLES
+from rig.serve.transport.exposure.certificates import (
+    HOLDERS,
+    SERVER,
+    add_device,
+    create_keys,
+    read_holder,
+    remove_holder,
+)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -59,7 +66,8 @@ def test_existing_keys_are_replaced_only_on_request_and_if_ours(tmp_path: Path) 
         create_keys(folder)
     create_keys(folder, force=True)
     assert files(folder).keys() == before.keys()
-    assert not set(files(folder).values()) & set(before.values())
+    changed = {name for name, data in files(folder).items() if data != before[name]}
+    assert changed == before.keys() - {"server/allowed.txt"}
     (folder / "viewer" / "notes.txt").write_text("mine")
     for other in (folder, folder / "viewer" / "notes.txt"):
         with pytest.raises(InputError, match=r"^DIR must be a new folder"):
@@ -130,6 +138,71 @@ def test_the_command_explains_where_each_folder_belongs(tmp_path: Path, capsys: 
         assert capsys.readouterr().err.startswith(f"rig: {message}")
 
 
+def run_command(*arguments: object) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["keys", *map(str, arguments)])
+    assert end.value.code == 0
+
+
+def test_a_device_is_added_and_withdrawn_by_a_kept_authority(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "keys"
+    run_command("init", folder, "--keep-authority", "--days", 10)
+    run_command("add", folder, "daq1", "--truth", "--days", 300)
+    assert f"{folder}/daq1: for the device daq1, role recorder, until" in capsys.readouterr().out
+    device, rig = read_holder(folder / "daq1", server=False), read_holder(folder, server=True)
+    assert rig.allowed == ("operator", "recorder", "viewer", device.name)
+    assert device.name.startswith("recorder+truth@daq1.")
+    assert device.expires == rig.expires, "no longer than the authority"
+    for name in ("daq1", "authority"):
+        assert stat.S_IMODE((folder / name / "key.pem").stat().st_mode) == 0o600
+        assert stat.S_IMODE((folder / name).stat().st_mode) == 0o700
+    run_command("remove", folder, "daq1")
+    run_command("remove", folder, "viewer")
+    assert read_holder(folder, server=True).allowed == ("operator", "recorder")
+    assert sorted(path.name for path in folder.iterdir()) == ["authority", "operator", "recorder", "server"]
+    add_device(folder, "daq1", "viewer")
+    create_keys(folder, force=True)  # replaces the folders of devices too
+    assert sorted(path.name for path in folder.iterdir()) == sorted(HOLDERS)
+    other = tmp_path / "other"  # with files of the same names, which the product did not make
+    other.mkdir()
+    (other / "site").mkdir()
+    (other / "site" / "key.pem").write_text("mine")
+    with pytest.raises(InputError, match=r"^DIR must be a new folder"):
+        create_keys(other, force=True)
+    assert (other / "site" / "key.pem").read_text() == "mine"
+
+
+def test_devices_that_cannot_be_added_or_withdrawn(tmp_path: Path) -> None:
+    folder, without = tmp_path / "keys", tmp_path / "without"
+    create_keys(folder, keep_authority=True)
+    create_keys(without)
+    add_device(folder, "daq1", "viewer")
+    before = files(folder)
+    for name in ("daq1", "operator", "server", "authority", "", "..", "a/b", "a b", "a*", "-a", "x" * 33, "a\n"):
+        with pytest.raises(InputError, match=r"^NAME must be a new name of letters, digits and hyphens"):
+            add_device(folder, name, "viewer")
+    for name in ("daq2", "server", "authority", "", "..", "recorder+truth"):
+        with pytest.raises(InputError, match=r"^NAME must be a device or role that .* admits"):
+            remove_holder(folder, name)
+    with pytest.raises(InputError, match=r"^--role must be one of operator, recorder, viewer; received 'boss'"):
+        add_device(folder, "daq2", "boss")
+    for other in (without, tmp_path / "nowhere"):
+        with pytest.raises(InputError, match=r"^DIR must be a folder made by: rig keys init --keep-authority"):
+            add_device(other, "daq2", "viewer")
+    assert files(folder) == before
+    create_keys(folder, keep_authority=True, days=-0.01, force=True)
+    with pytest.raises(InputError, match=r"^DIR must be a folder with an authority that is valid .* expired on 2"):
+        add_device(folder, "daq2", "viewer")
+    for wrong in (b"root\n", b"viewer@a/b.00000000\n", b"\xff"):
+        (without / "server" / "allowed.txt").write_bytes(wrong)
+        with pytest.raises(InputError, match=r"allowed.txt must be a list of certificates' names"):
+            read_holder(without, server=True)
+    (without / "server" / "allowed.txt").unlink()  # as in folders of earlier versions
+    assert read_holder(without, server=True).allowed == ROLE_NAMES
+
+
 def test_exposure_reports_the_admitted_roles(tmp_path: Path) -> None:
     create_keys(tmp_path / "keys")
     assert Serving().exposure() is None
@@ -147,6 +220,14 @@ def test_exposure_reports_the_admitted_roles(tmp_path: Path) -> None:
     for keys, plaintext in ((tmp_path / "keys", False), (None, True)):
         with pytest.raises(InputError, match="given with --expose HOST"):
             Serving(tls=keys, plaintext=plaintext).exposure()
+
+
+def test_exposure_prints_who_is_admitted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    create_keys(tmp_path / "keys", truth=["viewer"])
+    remove_holder(tmp_path / "keys", "operator")
+    exposed = Serving(expose="192.0.2.1", tls=tmp_path / "keys").exposure()
+    print_addresses(SimpleNamespace(endpoint="127.0.0.1:7460"), exposed)  # type: ignore[arg-type]
+    assert "rig: exposed at 192.0.2.1:7463 to recorder, viewer+truth (permissions: rig keys)" in capsys.readouterr().err
 
 
 def test_exposure_without_tls_reports_what_is_open(capsys: pytest.CaptureFixture[str]) -> None:

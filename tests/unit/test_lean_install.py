@@ -101,7 +101,8 @@ OTHER_EXTRAS = {"asammdf", "nptdms", "pyuff", "soundfile", "pytest", "xdist", "m
 LEAN_ARGUMENTS = {
     "info": "{rec}", "info --json": "{rec}", "cut": "{rec} --from 0.1 --to 0.2 -o {folder}/cut.mcap",
     "recover": "{rec} --force -o {folder}/recovered.mcap", "export": "{rec} --to 0.1 -o {folder}/run.csv",
-    "keys init": "{folder}/keys --host 127.0.0.1", "completion": "bash", "hammer": "-h", "speed": "-h", "release": "-h",
+    "keys init": "{folder}/keys --host 127.0.0.1 --keep-authority", "keys add": "{folder}/keys daq1",
+    "keys remove": "{folder}/keys daq1", "completion": "bash", "hammer": "-h", "speed": "-h", "release": "-h",
     "fault": "-h", "stop": "-h", "step": "-h", "status": "-h", "note": "-h", "twins": "-h", "record": "-h",
     "replay": "-h", "pause": "-h", "resume": "-h", "seek": "-h", "rate": "-h",
 }  # fmt: skip

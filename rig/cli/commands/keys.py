@@ -93,6 +93,9 @@ def init(
     truth: Annotated[
         list[str] | None, typer.Option(metavar="ROLE", help="Role that may also read the truth; repeatable")
     ] = None,
+    keep_authority: Annotated[
+        bool, typer.Option("--keep-authority", help="Keep the signing key, for `rig keys add`")
+    ] = False,
     force: Force = False,
 ) -> None:
     """Create the certificates for an exposed rig: its own, and one for each role.
@@ -101,9 +104,11 @@ def init(
     """
     from rig.serve.transport import EXPOSED_PORT
     from rig.serve.transport.exposure.access import ROLES
-    from rig.serve.transport.exposure.certificates import SERVER, create_keys
+    from rig.serve.transport.exposure.certificates import AUTHORITY, SERVER, create_keys
 
-    names = create_keys(folder, hosts=host or [], days=days, truth=truth or [], force=force)
+    names = create_keys(
+        folder, hosts=host or [], days=days, truth=truth or [], keep_authority=keep_authority, force=force
+    )
     echo(f"{folder / SERVER}: stays on this computer, {', '.join(names)}:")
     echo(f"    rig run SCENE --expose {names[0]} --tls {folder}")
     for role in ROLES:
@@ -113,4 +118,37 @@ def init(
     if not host:
         echo("Without --host the certificates are valid on this computer only.")
     echo(f"Valid for {days} days. A folder grants its role: copy it securely, for example with scp -r.")
-    echo("The signing key is not kept: to add or revoke a certificate, create all again (--force).")
+    if keep_authority:
+        echo(f"{folder / AUTHORITY}: the signing key, for `rig keys add`. Who reads it can admit anybody.")
+    else:
+        echo("The signing key is not kept: to add a certificate, create all again (--keep-authority, --force).")
+
+
+def add(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder made with --keep-authority")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the device")],
+    *,
+    role: Annotated[str, typer.Option(metavar="ROLE", help="operator, recorder or viewer")] = "recorder",
+    truth: Annotated[bool, typer.Option("--truth", help="It may also read the truth")] = False,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="Validity of the certificate in days")] = 365,
+) -> None:
+    """Add the certificate of one device, which is bound to its name.
+
+    Its commands and reports carry this name, whatever name the device gives itself.
+    """
+    from rig.serve.transport.exposure.certificates import add_device
+
+    expires = add_device(folder, name, role, truth=truth, days=days)
+    echo(f"{folder / name}: for the device {name}, role {role}, until {expires:%Y-%m-%d}; copy it to its computer")
+    echo("A running rig admits it after a restart.")
+
+
+def remove(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder made by `rig keys init`")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a device or role")],
+) -> None:
+    """Withdraw the certificate of a device or a role."""
+    from rig.serve.transport.exposure.certificates import remove_holder
+
+    remove_holder(folder, name)
+    echo(f"{name}: withdrawn, and {folder / name} removed. A running rig denies it after a restart.")

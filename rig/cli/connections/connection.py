@@ -212,7 +212,8 @@ def print_addresses(server: ZenohServer, exposed: Exposure | None, name: str | N
 
     if exposed is not None and exposed.holder is not None:
         own = f"{exposed.holder.name} until {exposed.holder.expires:%Y-%m-%d}"
-        echo(f"rig: exposed at {exposed.endpoint} to holders of certificates (permissions: rig keys)", err=True)
+        admitted = ", ".join(exposed.holder.allowed) or "nobody"
+        echo(f"rig: exposed at {exposed.endpoint} to {admitted} (permissions: rig keys)", err=True)
         echo(f"rig: certificate of the rig: {own}", err=True)
     elif exposed is not None:
         permissions = ", ".join(permission.title for permission in (*ROLES["operator"], TRUTH))

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,7 +27,7 @@ from rig.serve.transport.endpoint import (
     parse_endpoint,
     read_backlogs,
 )
-from rig.serve.transport.exposure.access import Action, is_allowed, rules
+from rig.serve.transport.exposure.access import Action, bind_key, is_allowed, rules
 from rig.serve.transport.names import parse_url, resolve_endpoint
 from rig.serve.transport.recovery import CACHE, Publisher, Recovery
 from rig.serve.transport.session import PATIENCE_S, Session, build_config, fifo, get_encoding, locator
@@ -101,6 +102,7 @@ class ZenohServer(Closing):
         self.endpoint = f"{host}:{port}"
         self._ports = {port}
         locators, settings = [locator(host, port)], dict[str, Any](_FROM_CLIENTS)
+        allowed = () if exposed is None or exposed.holder is None else exposed.holder.allowed
         if exposed is not None:
             host, port = parse_endpoint(exposed.endpoint, field="expose")
             self._ports.add(port)
@@ -109,7 +111,7 @@ class ZenohServer(Closing):
             if exposed.holder is not None:
                 settings["transport/link/tls"] = exposed.holder.settings(listens=True)
         try:
-            self._session = Session(build_config(listen__endpoints=locators, access_control=rules(), **settings))
+            self._session = Session(build_config(listen__endpoints=locators, access_control=rules(allowed), **settings))
         except zenoh.ZError as error:
             field, where = "listen", self.endpoint
             if exposed is not None and f"{host}:{port}" in str(error):
@@ -273,6 +275,7 @@ class ZenohClient(Closing):
             from rig.serve.transport.exposure.certificates import read_holder
 
             self._holder = read_holder(tls, server=False)
+        self._role = None if self._holder is None else self._holder.name
         self.endpoint = f"{self._host}:{self._port}"
         self._declared: list[Any] = []
         self._rigs: set[str] = set()
@@ -344,6 +347,10 @@ class ZenohClient(Closing):
         return NoReplyError(f"{self.endpoint} listens, but refuses this client {explanation}")
 
     def _no_reply_error(self) -> NoReplyError:
+        if self._holder is not None and self._holder.expires <= datetime.now(UTC):
+            return NoReplyError(
+                f"the rig at {self.endpoint} refuses the certificate in {self._holder.describe_expiry()}"
+            )
         start = "start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
         return NoReplyError(f"no rig answers at {self.endpoint}; {start}")
 
@@ -445,6 +452,7 @@ class ZenohClient(Closing):
         """
         import zenoh
 
+        role, key = self._role, bind_key(self._role, key)
         deadline, restart_deadline, linked = (
             Deadline(timeout_s),
             Deadline(min(timeout_s, _RESTART_S)),
@@ -470,11 +478,13 @@ class ZenohClient(Closing):
                 raise NoReplyError(f"the link to the rig at {self.endpoint} was lost before the reply to {key}")
             # Without a rig the reply is empty at once; the rig may be about to start. A denied request looks the same.
             late = (deadline if self._linked_rigs() else restart_deadline).left_s <= _RETRY_S
-            role = None if self._holder is None else self._holder.name
             denied = not is_allowed(role, Action.ASK, key)
             if (late or denied) and self.tokens(wire.ALIVE):
                 reason = f"denies {key} to {role or 'everybody'}" if denied else f"does not answer {key}"
                 raise NoReplyError(f"the rig at {self.endpoint} {reason}")
+            if late and role is not None and self._linked_rigs():
+                reason = "its certificate was withdrawn, or the rig is still starting"
+                raise NoReplyError(f"the rig at {self.endpoint} allows nothing to {role}: {reason}")
             if late:
                 raise self._no_reply_error()
             time.sleep(_RETRY_S)
@@ -501,7 +511,7 @@ class ZenohClient(Closing):
         import zenoh
 
         self._session.session.put(
-            key,
+            bind_key(self._role, key),
             payload,
             encoding=get_encoding(key, None),
             congestion_control=zenoh.CongestionControl.DROP,

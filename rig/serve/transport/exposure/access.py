@@ -6,7 +6,7 @@ A rule applies to one direction: a key that may be received may not be published
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -65,6 +65,10 @@ ROLES: Mapping[str, tuple[Permission, ...]] = {
 """Permissions by the role in a certificate."""
 WITH_TRUTH = "+truth"
 """Suffix of a role in a certificate's name that grants access to the truth."""
+ROLE_NAMES = tuple(name for role in ROLES for name in (role, role + WITH_TRUTH))
+"""Common names of the certificates that any number of clients may share."""
+DEVICE_NAME = r"[A-Za-z0-9]([A-Za-z0-9-]{0,30}[A-Za-z0-9])?"
+"""Regular expression of a device's name; it is one part of a key."""
 
 _MESSAGES: Mapping[Action, Mapping[str, list[str]]] = {
     Action.ASK: {"ingress": ["query"], "egress": ["declare_queryable", "reply"]},
@@ -77,14 +81,35 @@ _MESSAGES: Mapping[Action, Mapping[str, list[str]]] = {
 _ALL_KEYS, _CACHES = f"{wire.ROOT}/**", f"{wire.ROOT}/**/@adv/**"
 _SUBSCRIBER_RULES = {"subscribe": (["declare_subscriber"], [_ALL_KEYS, _CACHES]), "fetch": (["query"], [_CACHES])}
 """A client that may receive at all may subscribe to anything; each outgoing message is checked."""
+_DECLARED = "declared for devices"
 
 
 def get_permissions(name: str | None) -> tuple[Permission, ...]:
     """Return the permissions by the common name of a certificate; None is a connection without TLS."""
     if name is None:
         return PERMISSIONS
-    role = name.removesuffix(WITH_TRUTH)
-    return (*ROLES.get(role, ()), *((TRUTH,) if role in ROLES and role != name else ()))
+    granted = name.partition("@")[0]
+    role = granted.removesuffix(WITH_TRUTH)
+    permissions = (*ROLES.get(role, ()), *((TRUTH,) if role in ROLES and role != granted else ()))
+    if (device := get_device(name)) is None:
+        return permissions
+    bound = {REPORTS: f"{wire.CLIENTS}/{device}", COMMANDS: f"{wire.COMMAND}/*/{device}"}
+    return tuple(
+        Permission(f"{each.title} of {device}", each.action, (bound[each],)) if each in bound else each
+        for each in permissions
+    )
+
+
+def get_device(name: str | None) -> str | None:
+    """Return the device in the common name of a certificate, `ROLE@DEVICE.NUMBER`; None if it names no device."""
+    return (name or "").partition("@")[2].rpartition(".")[0] or None
+
+
+def bind_key(name: str | None, key: str) -> str:
+    """Return the key under which the holder of a certificate sends a command or a report."""
+    if (device := get_device(name)) is not None and key.startswith(f"{wire.CLIENTS}/"):
+        return f"{wire.CLIENTS}/{device}"
+    return f"{key}/{device}" if device is not None and key.startswith(f"{wire.COMMAND}/") else key
 
 
 def is_allowed(name: str | None, action: Action, key: str) -> bool:
@@ -99,15 +124,22 @@ def is_allowed(name: str | None, action: Action, key: str) -> bool:
     )
 
 
-def rules() -> dict[str, Any]:
-    """Return the table as zenoh's `access_control` for the rig's session; ingress is data from clients."""
+def rules(allowed: Sequence[str]) -> dict[str, Any]:
+    """Return the table as zenoh's `access_control` for the rig's session; ingress is data from clients.
+
+    Args:
+        allowed: Common names of the certificates that have permissions.
+    """
+    names = [None, *allowed]
     rules = {
         f"{flow} {permission.title}": (flow, messages, _add_cache_keys(permission))
-        for permission in PERMISSIONS
+        for permission in dict.fromkeys(each for name in names for each in get_permissions(name))
         for flow, messages in _MESSAGES[permission.action].items()
     }
     rules |= {name: ("ingress", *rule) for name, rule in _SUBSCRIBER_RULES.items()}
-    names = [None, *(name for role in ROLES for name in (role, role + WITH_TRUTH))]
+    # A device sends what the rig has declared to receive: for all devices, not for each one.
+    declared = [wire.command_key("*/*"), *REPORTS.keys]
+    rules[_DECLARED] = ("egress", ["declare_queryable", "declare_subscriber"], declared)
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -126,6 +158,7 @@ def rules() -> dict[str, Any]:
                 "subjects": [name or PLAIN],
                 "rules": [
                     *_SUBSCRIBER_RULES,
+                    *([_DECLARED] if get_device(name) else []),
                     *(
                         f"{flow} {permission.title}"
                         for permission in get_permissions(name)
