@@ -18,6 +18,7 @@ from rig.channels.generators import Generator
 from rig.cli.app import COMMANDS, GROUPS, rig
 from rig.cli.command import Group
 from rig.cli.commands.completion import SCENE_KEYS, complete
+from rig.cli.main import main
 from rig.cli.options import parse_pairs, split_names
 from rig.physics.engine_choice import Limits
 from rig.physics.engines import ENGINES
@@ -191,6 +192,58 @@ def test_completed_keys_are_those_of_the_scene() -> None:
     others = {*("name", "title", "set", "commands", "pick"), *(name for name, parts in inner.items() if parts)}
     keys = keys - {"engine.limits"} | {f"engine.limits.{part}" for part in Limits.model_fields}
     assert set(SCENE_KEYS) == {key for key in keys - others if not key.startswith("pick.")}
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize("start", [None, b"", b"alias ll='ls -l'", b"# caf\xe9\n\nexport A=1\n"])
+def test_completion_is_removed_exactly(
+    shell: str, start: bytes | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def call(*options: str) -> str:
+        with pytest.raises(SystemExit) as end:
+            main(["completion", shell, *options])
+        assert end.value.code == 0
+        return capsys.readouterr().out
+
+    def files() -> dict[str, bytes]:
+        return {str(path): path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    for name in ("XDG_DATA_HOME", "XDG_CONFIG_HOME", "ZDOTDIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    begin, own = tmp_path / f".{shell}rc", tmp_path / "dotfiles"
+    if start is not None:
+        own.write_bytes(start)
+        own.chmod(0o600)
+        begin.symlink_to(own)
+    before = files()
+    assert call("--remove") == f"nothing is installed for {shell}\n"
+    call("--install")
+    call("--install")
+    assert files() != before
+    call("--remove")
+    assert files() == before
+    assert start is None or (begin.is_symlink() and own.stat().st_mode & 0o777 == 0o600)
+    call("--install")
+    with begin.open("ab") as out:
+        out.write(b"export B=1\n")
+    call("--remove")
+    added = b"\n" if start is not None and shell != "fish" else b""  # separates the lines of the user
+    assert begin.read_bytes() == (start or b"") + added + b"export B=1\n"
+    assert call("--remove") == f"nothing is installed for {shell}\n"
+    assert files().keys() == {str(begin), *before}
+
+
+def test_completion_leaves_the_script_of_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    own = tmp_path / "fish" / "completions" / "rig.fish"
+    own.parent.mkdir(parents=True)
+    own.write_text("complete -c rig -a mine")
+    for options, status in ((["--remove"], 0), (["--install", "--remove"], 2)):
+        with pytest.raises(SystemExit) as end:
+            main(["completion", "fish", *options])
+        assert end.value.code == status
+    assert own.read_text() == "complete -c rig -a mine"
 
 
 @pytest.mark.wallclock

@@ -13,12 +13,13 @@ import re
 import shlex
 import tomllib
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
 
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 from rig.base.text import printable
 from rig.cli.command import Group
 from rig.cli.output.tables import echo, echo_document
@@ -50,6 +51,7 @@ def completion(
     shell: Annotated[str | None, typer.Argument(metavar="[bash|zsh|fish]", help="Shell; default: $SHELL")] = None,
     *,
     install: Annotated[bool, typer.Option("--install", help="Install for every new shell of this user")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove what --install wrote")] = False,
 ) -> None:
     """Complete commands, options and names in a shell by Tab: `rig completion --install`, then open a new shell.
 
@@ -58,32 +60,61 @@ def completion(
     shell = shell or Path(os.environ.get("SHELL", "")).name
     if shell not in _SHELLS:
         raise InputError("shell", "bash, zsh or fish", shell)
+    if install and remove:
+        raise InputError("--remove", "given without --install", Words("both"))
     script = Path(__file__).with_suffix(f".{shell}").read_text(encoding="utf-8")
-    if not install:
+    if not install and not remove:
         echo_document(script)
         return
-    for path in _install(shell, script):
-        echo(f"{path} written")
-    echo(f"in a new {shell}, Tab completes rig commands")
+    paths = _remove(shell) if remove else _install(shell, script)
+    for path in paths:
+        echo(f"{path} {'cleared' if remove else 'written'}")
+    if install or not paths:
+        echo(f"in a new {shell}, Tab completes rig commands" if install else f"nothing is installed for {shell}")
+
+
+def _locate(shell: str) -> tuple[Path, Path | None, str]:
+    """Return the path of the installed script, the shell's start file, and the line there that loads the script."""
+    home = Path.home()
+    if shell == "fish":
+        return Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config") / "fish/completions/rig.fish", None, ""
+    file = Path(os.environ.get("XDG_DATA_HOME") or home / ".local/share") / f"rig/completion.{shell}"
+    begin = home / ".bashrc" if shell == "bash" else Path(os.environ.get("ZDOTDIR") or home) / ".zshrc"
+    return file, begin, f"[ -r {shlex.quote(str(file))} ] && . {shlex.quote(str(file))}  # rig completion --install\n"
 
 
 def _install(shell: str, script: str) -> list[Path]:
     """Write the script, and add a line to the shell's start file that loads it; return the files written."""
-    home = Path.home()
-    if shell == "fish":
-        file = Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config") / "fish/completions/rig.fish"
-        begin = None
-    else:
-        file = Path(os.environ.get("XDG_DATA_HOME") or home / ".local/share") / f"rig/completion.{shell}"
-        begin = home / ".bashrc" if shell == "bash" else Path(os.environ.get("ZDOTDIR") or home) / ".zshrc"
+    file, begin, line = _locate(shell)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(script, encoding="utf-8")
-    line = f"[ -r {shlex.quote(str(file))} ] && . {shlex.quote(str(file))}  # rig completion --install"
     if begin is None or (begin.exists() and line in begin.read_text("utf-8", errors="replace")):
         return [file]
+    line = f"\n{line}" if begin.exists() else line
     with begin.open("a", encoding="utf-8") as out:
-        out.write(f"\n{line}\n")
+        out.write(line)
     return [file, begin]
+
+
+def _remove(shell: str) -> list[Path]:
+    """Remove the script, and the line from the start file; return the files that were changed or removed."""
+    file, begin, line = _locate(shell)
+    changed = [file] if file.exists() and f"__complete {shell}" in file.read_text("utf-8", errors="replace") else []
+    for script in changed:
+        script.unlink()
+    with suppress(OSError):
+        file.parent.rmdir()  # if it is empty
+    found = begin.read_bytes() if begin is not None and begin.exists() else b""
+    left = found.removesuffix(b"\n" + line.encode()).replace(line.encode() or b"\0", b"")
+    if begin is None or left == found:
+        return changed
+    if found == line.encode():  # the installation has created it
+        begin.unlink()
+    else:
+        with begin.open("r+b") as out:  # not replaced: keeps its mode and links, and needs no room on the disk
+            out.write(left)
+            out.truncate()
+    return [*changed, begin]
 
 
 def complete(root: Group, shell: str, line: str) -> list[str]:
