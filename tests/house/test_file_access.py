@@ -17,6 +17,7 @@ EXCEPTIONS = {
     "rig/base/files.py": "the functions themselves",
     "rig/base/checks.py:read_json": "the function itself",
     "rig/cli/commands/completion.py:_install": "the start file of the user's shell, which may be a link",
+    "rig/cli/commands/completion.py:_remove": "the same",
     "rig/cli/commands/keys.py:_values": _INTERNAL,
     "rig/cli/commands/view.py:_saved": _DRAFT,
     "rig/physics/engines/tape/taylor.py": "run by a developer, who generates a file of the source",

@@ -45,7 +45,7 @@ BUDGETS = {
     "rig": 53,
     "rig/base": 947,
     "rig/channels": 2419,
-    "rig/cli": 5310,
+    "rig/cli": 5335,
     "rig/physics": 5456,
     "rig/run": 1821,
     "rig/serve": 2992,

@@ -22,7 +22,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rig.base.errors import InputError, Words, whole_file
+from rig.base.errors import InputError, Words
+from rig.base.files import write_file
 from rig.serve.transport.exposure.access import DEVICE_NAME, ROLE_NAMES, ROLES, WITH_TRUTH, get_device
 
 if TYPE_CHECKING:
@@ -153,8 +154,7 @@ def _read_allowed(server: Path) -> list[str]:
 
 
 def _write_allowed(server: Path, names: Sequence[str]) -> None:
-    with whole_file(server / _ALLOWED) as draft:
-        draft.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+    write_file(server / _ALLOWED, "".join(f"{name}\n" for name in names))
 
 
 def _check_replaceable(folder: Path, *, force: bool) -> None:
