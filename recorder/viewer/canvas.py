@@ -11,6 +11,8 @@ import rerun as rr
 from recorder.viewer.clock import WallClock
 
 APPLICATION = "rig"
+VIEWING_BATCH_S = 0.1
+"""Time over which data are sent to a viewer together [s]."""
 SIMULATED = "simulated_time"
 WALL = "wall_time"
 PICTURE = "picture"
@@ -19,7 +21,7 @@ Place = tuple[float, float]
 RGB = tuple[int, int, int]
 
 
-def new_stream(name: str, *, batch_s: float = 0.1) -> rr.RecordingStream:
+def new_stream(name: str, *, batch_s: float = VIEWING_BATCH_S) -> rr.RecordingStream:
     """Return an unconnected recording stream.
 
     Args:

@@ -25,6 +25,8 @@ from rig.serve.transport.clients import Reporter
 NAME = "viewer"
 ROWS_PER_S = 500.0
 """Points of each curve per simulated second [Hz], except for full rate around hammer pulses."""
+SAVING_INTERVAL_S = 10.0
+"""Time over which data are written to a file together [s]; rerun keeps 1 kB in memory for each written piece."""
 _TICK_S = MIN_INTERVAL_S
 _HEARTBEAT_INTERVAL_S = 0.5
 _MAX_WAITING = 4000
@@ -95,6 +97,7 @@ class LiveView:
         *,
         wall: Callable[[], float] = time.time,
         get_processed: Callable[[], int | None] | None = None,
+        interval_s: float = CURVE_INTERVAL_S,
     ) -> None:
         """Prepare the canvas without receiving anything yet.
 
@@ -105,6 +108,7 @@ class LiveView:
             wall: Wall clock [unix s].
             get_processed: Returns the number of the latest picture that the viewer has processed, or None if no viewer
                 is open. Without this function, pictures are not counted and curves are not thinned for the viewer.
+            interval_s: Interval at which curves are drawn; for a file, `SAVING_INTERVAL_S` [s].
         """
         self._client = client
         self._reporter = Reporter(client, NAME)
@@ -118,6 +122,7 @@ class LiveView:
         self._force_column = columns.index("normal_force") if "normal_force" in columns else None
         self._get_processed = get_processed
         self._pace = None if get_processed is None else Pace()
+        self._interval_s = interval_s
         self._curves_s = self._folded_s = self._noted_s = -math.inf
         self._noted_every_s = MIN_INTERVAL_S
         self._fresh = False
@@ -188,10 +193,10 @@ class LiveView:
                 self._pace.record_displayed(self._get_processed(), now_s=now_s)
             if self._pace is None or self._pace.due(now_s):
                 self._draw(now_s)
-            elif now_s - self._folded_s >= CURVE_INTERVAL_S:
+            elif now_s - self._folded_s >= self._interval_s:
                 self._painter.fold(most=MAX_POINTS)
                 self._folded_s = now_s
-            if now_s - check_s >= _CHECK_INTERVAL_S:
+            if now_s - check_s >= max(_CHECK_INTERVAL_S, self._interval_s):
                 self._check_canvas()
                 if self._pace is not None:
                     self._report_pace(self._pace, now_s, on_message)
@@ -249,7 +254,7 @@ class LiveView:
             self._pace.record_drawn(self._canvas.picture, now_s=now_s)
         for name in self._groups.values():
             self._painter.frame(name)
-        if now_s - self._curves_s >= CURVE_INTERVAL_S - 1e-6:
+        if now_s - self._curves_s >= self._interval_s - 1e-6:
             self._painter.flush(most=None if self._pace is None else MAX_POINTS)
             self._curves_s = now_s
         self._fresh = False

@@ -128,13 +128,13 @@ def check_output_differs(sources: list[Path], output: Path, *, field: str = "out
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary file that replaces `path` if the block succeeds, and is removed otherwise.
 
-    A symbolic link at `path` is replaced, not followed. A killed process leaves the temporary file, whose name begins
-    with a dot.
+    A symbolic link at `path` is replaced, not followed. A killed process leaves the temporary file, whose name ends in
+    .part.
 
     Raises:
         DiskError: The disk refused, whatever error the writing library raised.
     """
-    draft = path.with_name(f".{path.name[:_MAX_NAME]}.{secrets.token_hex(8)}{PART_SUFFIX}")
+    draft = path.with_name(f"{path.name[:_MAX_NAME]}.{secrets.token_hex(8)}{PART_SUFFIX}")
     try:
         os.close(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield draft

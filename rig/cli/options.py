@@ -64,7 +64,7 @@ class SceneChanges:
         """
         overrides = parse_pairs("--set", self.changes, "KEY=VALUE, such as drive.speed_hz=5.2")
         if self.law is not None:
-            from rig.physics.law_file import read_law
+            from rig.run.law_file import read_law
 
             overrides |= {key: str(value) for key, value in read_law(self.law).changes().items()}
         named = {

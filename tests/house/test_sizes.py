@@ -32,7 +32,7 @@ BUDGETS = {
     "recorder/contents": 1268,
     "recorder/files": 830,
     "recorder/output": 544,
-    "recorder/viewer": 1893,
+    "recorder/viewer": 1896,
     "replays": 0,
     "replays/campaigns": 3152,
     "replays/estimate": 337,
@@ -45,9 +45,9 @@ BUDGETS = {
     "rig": 53,
     "rig/base": 947,
     "rig/channels": 2419,
-    "rig/cli": 5335,
-    "rig/physics": 5456,
-    "rig/run": 1821,
+    "rig/cli": 5344,
+    "rig/physics": 5479,
+    "rig/run": 1843,
     "rig/serve": 2992,
 }
 _NO_CODE = (

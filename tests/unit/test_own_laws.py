@@ -13,9 +13,9 @@ from replays.studies.common.twelve_scenes import TWELVE_SCENES
 from rig.base.errors import InputError
 from rig.cli.main import main
 from rig.physics.contacts import DAMPING, STIFFNESS, WORKING_FORCES, fit_power, restitution_factor, stiffness_law
-from rig.physics.law_file import read_law
 from rig.physics.model import build_model, contact_pair
 from rig.physics.parameters import load_parameters
+from rig.run.law_file import read_law
 from tests.commands import run_captured, run_for_output
 
 LIU = "pi/2 * E * L * delta * sqrt(delta / (2 * (r0 + delta)))"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -337,7 +338,9 @@ def test_a_picture_gets_its_name_only_when_complete(tmp_path: Path, monkeypatch:
         assert (ended.value.code or 0) == code
         assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]
         assert (target.read_bytes() == b"precious") == bool(code)
-    assert listings == [["run.rrd", "run.rrd.part"]]
+    ((name, draft),) = listings
+    assert name == "run.rrd"
+    assert re.fullmatch(r"run\.rrd\.[0-9a-f]{16}\.part", draft)
 
 
 def test_faults_and_commands_are_marks_from_begin_to_end(tmp_path: Path) -> None:

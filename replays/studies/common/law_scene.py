@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 from replays.studies.common.twelve_scenes import TWELVE_SCENES, StudyScene
-from rig.physics.law_file import read_law
 from rig.physics.model import build_model
+from rig.run.law_file import read_law
 
 
 def add_law_scene(path: Path) -> str:
@@ -17,7 +17,7 @@ def add_law_scene(path: Path) -> str:
     The scene's name contains a digest of the law, so that points of different laws are never mixed in a table.
 
     Args:
-        path: The file (`rig.physics.law_file`).
+        path: The file (`rig.run.law_file`).
 
     Returns:
         The scene's name.

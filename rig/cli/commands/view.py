@@ -128,14 +128,15 @@ def _view_file(
 
 def _view_live(connection: Connection, *, web: bool, save: Path | None, only: str | None) -> None:
     from recorder.viewer import blueprint, live, window
-    from recorder.viewer.canvas import Canvas, new_stream
+    from recorder.viewer.canvas import VIEWING_BATCH_S, Canvas, new_stream
 
     with connection.client() as client:
         described = live.request_document(client)
-        stream = new_stream(f"rig at {connection.connect}")
+        batch_s = VIEWING_BATCH_S if save is None else live.SAVING_INTERVAL_S
+        stream = new_stream(f"rig at {connection.connect}", batch_s=batch_s)
         plan = blueprint.layout(described.table, described.geometry, live=True, only=only)
         if save is not None:
-            view = live.LiveView(client, Canvas(stream), described)
+            view = live.LiveView(client, Canvas(stream), described, interval_s=live.SAVING_INTERVAL_S)
             with _saved(stream, save, plan, until_interrupted=True):
                 echo(view.run())
             if view.failed:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import subprocess
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+from numba.core import config
 from numba.core.event import Listener
 
 from rig.cli.output.background_compiling import MARCH, SERIES, start_second_process
+from rig.physics.kernel_cache import remove_old_kernels
 
 _ENGINE_S = 40
 """Processor time to compile an engine with its kernels on a typical computer [s]."""
@@ -51,6 +54,7 @@ class Compiling(Listener):
             self._on_text(text)
         else:
             self._on_first_text(f"{text}, once on this machine")
+            remove_old_kernels(Path(vars(config)["CACHE_DIR"]))
         self._has_reported = True
 
     def on_end(self, event: Any) -> None:
