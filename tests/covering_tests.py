@@ -83,11 +83,11 @@ class _Tracer(MetaPathFinder):
 
     @property
     def lines(self) -> set[tuple[str, int]]:
-        """Lines executed since the last call of `taken`, with their files."""
+        """Lines executed since the last call of `take_lines`, with their files."""
         return {(file, line) for file, first, last in self._seen for line in range(first, last + 1)}
 
-    def taken(self) -> set[tuple[str, int]]:
-        """Return these lines and begin again."""
+    def take_lines(self) -> set[tuple[str, int]]:
+        """Return these lines and clear the record."""
         lines = self.lines
         self._seen.clear()
         return lines
@@ -102,12 +102,12 @@ class _Recording:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
-        self._tracer.taken()
+        self._tracer.take_lines()
         before_s = time.process_time()
         result = yield
         shared = self._shared.setdefault(item.nodeid.partition("::")[0], set())
         lines: dict[str, list[int]] = {}
-        for file, line in sorted(self._tracer.taken() | shared):
+        for file, line in sorted(self._tracer.take_lines() | shared):
             lines.setdefault(file, []).append(line)
         self._record[item.nodeid] = {"cpu_s": round(time.process_time() - before_s, 3), "lines": lines}
         return result
@@ -170,7 +170,7 @@ def _uses(text: str, name: str) -> set[int]:
     }
 
 
-def _in_turn(tests: list[str]) -> list[str]:
+def _alternate(tests: list[str]) -> list[str]:
     """Return one case of each test function, then the second of each, and so on."""
     cases = Counter[str]()
     turns = {test: (cases.update([test.partition("[")[0]]), cases[test.partition("[")[0]])[1] for test in tests}
@@ -205,7 +205,7 @@ def order_tests(record: Record, texts: dict[str, str], file: str, first: int, la
         for test, ran in record.items():
             if test not in ids and any(f in lines and lines[f].intersection(n) for f, n in ran["lines"].items()):
                 groups.setdefault(test.partition("::")[0], []).append(test)
-        files = [_in_turn(sorted(group, key=lambda test: widths[test])) for group in groups.values()]
+        files = [_alternate(sorted(group, key=lambda test: widths[test])) for group in groups.values()]
         files.sort(key=lambda group: widths[group[0]])
         for whole in (False, True):
             for group in files:

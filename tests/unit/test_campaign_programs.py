@@ -11,7 +11,7 @@ from recorder.reader import Recording
 from replays.campaigns.equipment.cleanup import find_containment
 from replays.campaigns.equipment.process import Program
 from replays.campaigns.files.case_results import CaseRecording
-from rig.base.errors import InputError
+from rig.base.errors import DiskError, InputError
 from tests import waiting
 from tests.processes import ROOT
 
@@ -57,6 +57,27 @@ def test_a_child_in_a_session_of_its_own_ends_with_its_program(tmp_path: Path, m
     assert program.wait(60.0) == status
     program.end()
     waiting.until(lambda: not is_running(int((tmp_path / "child").read_text())))
+
+
+def test_status_and_lines_of_a_program(tmp_path: Path) -> None:
+    for code, status, line in (
+        ("print('one'); print('two words'); print(' ')", 0, "two words"), ("raise SystemExit(3)", 3, "nothing"),
+        ("import os; os.kill(os.getpid(), 15)", 143, "nothing"),
+    ):  # fmt: skip
+        program, calls = start(tmp_path, code), list[int]()
+        program.before_end = lambda calls=calls: calls.append(1)
+        assert program.wait(60.0) == status
+        assert program.last_line == line
+        assert program.wait_for("two", 60.0) == ("two words" if line != "nothing" else None)
+        assert not program.is_output_cut
+        for _ in range(2):
+            program.end()
+        assert (calls, program.is_ended) == ([1], True)
+    missing = Program(["./nothing"], tmp_path / "program.log", folder=tmp_path)
+    assert (missing.wait(60.0), missing.last_line) == (127, "./nothing: No such file or directory")
+    missing.end()
+    with pytest.raises(DiskError, match="could not be started"):
+        Program(["./nothing"], tmp_path / "none/program.log", folder=tmp_path)
 
 
 def test_output_is_bounded_and_read_although_the_file_was_replaced(tmp_path: Path) -> None:

@@ -110,6 +110,49 @@ def test_expected_events_are_checked_for_time_and_order(seen: CaseRecording) -> 
     assert one(seen, order=[start, hammer]).good
     turned = one(seen, order=[hammer, start])
     assert (turned.good, turned.value) == (False, 1.0)
+    assert one(seen, order=[start, start], to_s=0.02).value == 2.0
+    assert one(seen, order=[start, hammer], to_s=0.02).value == 1.0
+    for window, count in (({"from_s": 0.02}, 1), ({"from_s": 0.021}, 0), ({"to_s": 0.02}, 0), ({"to_s": 0.021}, 1)):
+        assert one(seen, event="hammer", take="count", must="== 1", **window).value == count
+    hidden = one(seen, event="hammer", since=start, from_s=0.01, must="<= 1 s")
+    assert hidden.note == "the origin of the time never occurred"
+    hit = one(seen, event="end", since=hammer, must="<= 600 ms")
+    assert (hit.value, hit.at_s, hit.since_s, hit.resolution) == (580.0, 0.6, 0.02, "1 tick, 1 us")
+
+
+def test_selectors_search_lists_and_times_count_from_the_origin(seen: CaseRecording) -> None:
+    late, noted = CaseRecording(seen.recording, Path(), origin_s=0.015), CaseRecording(seen.recording, Path())
+    assert one(late, event="hammer", must="== 5 ms").good
+    value = one(late, signal="disk_x", take="value", at_s=0.285, must="<= 9 mm").value
+    assert value == one(seen, signal="disk_x", take="value", at_s=0.3, must="<= 9 mm").value
+    noted.events = [
+        (0.1, {"event": "note", "tags": ["trip", "x"], "text": "x trips"}),
+        (0.2, {"event": "note", "tags": ["y"], "text": "", "what": {"kind": "gain"}}),
+    ]
+    for where, text, count in (
+        ({"tags": "trip"}, "", 1), ({"tags": ["trip", "x"]}, "", 1), ({"tags": "z"}, "", 0), ({}, "trips", 1),
+        ({"what": {"kind": "gain"}}, "", 1), ({"tags": "y"}, "trips", 0), ({}, "", 2),
+    ):  # fmt: skip
+        assert one(noted, event="note", where=where, text=text, take="count", must="== 1").value == count
+
+
+def test_a_level_is_exceeded_on_either_side(seen: CaseRecording) -> None:
+    rows = seen.recording.samples("disk_y")
+    radius, times_s = np.abs(rows["disk_y"]), rows.times_s
+    assert rows["disk_y"][np.argmax(radius > 0.5)] < 0.0
+    since = {"signal": "disk_y", "beyond": "0.5 mm"}
+    begins_s, first_s = (float(times_s[np.argmax(radius > level)]) for level in (0.5, 1.0))
+    found = one(seen, signal="disk_y", take="first beyond", beyond="1 mm", since=since, must="<= 9 ms")
+    assert (found.value, found.at_s) == (pytest.approx(1e3 * (first_s - begins_s)), first_s)
+    begins_s, last_s = times_s[np.argmax((radius > 0.5) & (times_s >= 0.4))], times_s[np.flatnonzero(radius > 1.0)[-1]]
+    found = one(seen, signal="disk_y", take="last beyond", beyond="1 mm", since=since, from_s=0.4, must="<= 1 s")
+    assert (found.value, found.level) == (pytest.approx(last_s - begins_s), 1.0)
+    peak = one(seen, signal="disk_y", to_s=0.04, must="<= 9 mm")
+    assert (peak.value, peak.at_s) == (pytest.approx(radius[:200].max()), times_s[np.argmax(radius[:200])])
+    assert rows["disk_y"][np.argmax(radius[:200])] < 0.0
+    caused = one(seen, event="end", since=since, must="<= 1 s")
+    assert (caused.level, caused.channels) == (0.5, ("disk_y",))
+    assert caused.value == pytest.approx(0.6 - times_s[np.argmax(radius > 0.5)])
 
 
 def test_a_scorecard_is_an_expectation(seen: CaseRecording) -> None:
@@ -214,6 +257,8 @@ def test_only_a_device_that_must_be_killed_fails(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("op", "limit", "value", "margin", "good"), [
     ("<=", 3.0, 3.0, 0.0, True), ("<", 3.0, 3.0, 0.0, False), (">=", 3.0, 2.5, -0.5, False),
     (">", 3.0, 3.5, 0.5, True), ("==", 3.0, 3.0, 0.0, True), ("==", 3.0, 3.5, -0.5, False),
+    ("==", 3.0, 2.5, -0.5, False), ("!=", 3.0, 2.5, 0.5, True), ("between", (1.0, 3.0), 1.25, 0.25, True),
+    ("between", (1.0, 3.0), 3.5, -0.5, False),
     ("!=", 3.0, 3.0, 0.0, False), ("between", (1.0, 3.0), 2.5, 0.5, True), ("between", (1.0, 3.0), 0.5, -0.5, False),
 ])  # fmt: skip
 def test_margin_and_verdict(op: str, limit: Any, value: float, margin: float, good: bool) -> None:
@@ -236,6 +281,11 @@ def test_a_measurement_takes_units_and_refuses_wrong_ones() -> None:
         (("gap", 0.15, "mm", "=<", 2.0, None), "op must be one of"),
         (("gap", 0.15, "mm", "between", 2.0, None), "two numbers, the lower first"),
         (("gap", 0.15, "mm", "<=", "much", None), "limit must be a number"),
+        (("gap", 0.15, "mm", "between", (3.0, 1.0), None), "two numbers, the lower first"),
+        (("gap", 0.15, "mm", "between", (0.1, math.nan), None), "two numbers, the lower first"),
+        (("gap", 0.15, "mm", "between", (0.1, 0.2, 0.3), None), "two numbers, the lower first"),
+        (("gap", 0.15, "mm", "<=", 2.0, "1"), "must be with a unit, as gap is in mm"),
+        (("turns", 0.15, "1", "<=", 2.0, "mm"), "must be without a unit, as turns has none"),
     ):
         with pytest.raises(InputError, match=re.escape(says)):
             judge_value(*given[:5], unit_of_limit=given[5])
@@ -326,6 +376,8 @@ def test_the_page_lists_failures_first_then_changes(tmp_path: Path) -> None:
         ("x.campaign.toml::fresh", "outcome"): ("", "passed", "new"),
         ("x.campaign.toml::gone", "outcome"): ("passed", "", "gone"),
     }
+    assert not list(changes(results(bad=-0.25), results(bad=-0.25 * (1.0 + 1e-12))))
+    assert [row.cells[-1] for row in changes(results(bad=-0.25), results(bad=-0.2))] == ["better"]
     folder = tmp_path / "evidence/bad"
     folder.mkdir(parents=True)
     session = Recording.open(ROOT / "replays/sessions/hammer-6.2.mcap")
@@ -359,6 +411,12 @@ def test_the_sheet_has_identity_verdicts_digests_and_room_to_sign(tmp_path: Path
     ):  # fmt: skip
         assert text in page, text
     assert "FAIL: " in make_sheet(found, tmp_path, {}).lead
+    for verdict, counts in (
+        ("FAIL", {"error": 1}), ("FAIL", {"failed": 1, "inconclusive": 1}), ("INCONCLUSIVE", {"interrupted": 1}),
+        ("INCONCLUSIVE", {"inconclusive": 1}), ("INCONCLUSIVE", {"skipped": 1}), ("INCONCLUSIVE", {"passed": 0}),
+        ("PASS", {}),
+    ):  # fmt: skip
+        assert make_sheet({**left, "counts": {**left["counts"], **counts}}, tmp_path, {}).lead.startswith(verdict)
     folder = tmp_path / "evidence/good"
     (folder / "files").mkdir(parents=True)
     for file in (folder / "event.png", folder / "files/event.png", folder / "mine.png"):
@@ -372,6 +430,46 @@ def test_the_sheet_has_identity_verdicts_digests_and_room_to_sign(tmp_path: Path
     for path in (tmp_path / "s.txt", tmp_path / "none/s.pdf"):
         with pytest.raises(InputError, match="--sheet must be"):
             check_sheet(path)
+
+
+def test_the_outcome_of_a_case_is_that_of_its_first_failed_phase(tmp_path: Path) -> None:
+    options = {"rig_url": "u v", "rig_limit": ["a=1 mm"]}
+    config = SimpleNamespace(
+        option=SimpleNamespace(rig_sheet=None), rootpath=tmp_path, getoption=options.get,
+        invocation_params=SimpleNamespace(dir=tmp_path / "sub"),
+    )  # fmt: skip
+    skip = ("x.py", 1, "Skipped: no bus")
+    for phases, outcome, reason in (
+        ((("setup", "passed"), ("call", "passed"), ("teardown", "passed")), "passed", ""),
+        ((("call", "failed", "\nE: a\nb"), ("teardown", "passed")), "failed", "E: a"),
+        ((("setup", "failed", "a"), ("teardown", "passed")), "error", "a"),
+        ((("call", "failed", "a"), ("teardown", "failed", "b")), "error", "a"),
+        ((("verdict", "open", "a"), ("teardown", "passed")), "inconclusive", "a"),
+        ((("setup", "skipped", skip), ("teardown", "passed")), "skipped", "no bus"),
+        ((("call", "passed"),), "interrupted", "the run ended before this case was finished"),
+        ((), "interrupted", "not run"),
+    ):
+        with end_results(Results(tmp_path / "out", (), cast("Any", config))) as found:
+            found.pytest_collection_finish(cast("Any", SimpleNamespace(items=[
+                SimpleNamespace(nodeid="x.py::a", location=("x.py", 1, "a"))
+            ])))  # fmt: skip
+            if phases:
+                found.pytest_runtest_logstart("x.py::a", ("x.py", 1, "a"))
+            for when, how, *text in phases:
+                report = SimpleNamespace(
+                    nodeid="x.py::a", when=when, duration=0.25, longrepr=(text or [""])[0], skipped=how == "skipped",
+                    failed=how in ("failed", "open"), rig_inconclusive=how == "open",
+                )  # fmt: skip
+                found.pytest_runtest_logreport(cast("Any", report))
+            document = found.document()
+        (case,) = document["cases"]
+        assert (case["outcome"], case["reason"]) == (outcome, reason)
+        assert document["counts"] == {**dict.fromkeys(document["counts"], 0), outcome: 1}
+        assert document["wall"]["cases"]["x.py::a"]["duration_s"] == 0.25 * len(phases)
+        assert case["repeat"] == "rig campaign ../x.py::a --url 'u v' --limit 'a=1 mm'"
+    started = Results(tmp_path / "out", (), cast("Any", config))
+    started.pytest_runtest_logstart("hammer.campaign.toml::b", (str(find_shipped()["hammer"]), None, ""))
+    assert started.document()["cases"][0]["repeat"].startswith("rig campaign hammer::b --url")
 
 
 def test_a_truncated_recording_cannot_be_a_bench(tmp_path: Path) -> None:
@@ -401,8 +499,8 @@ def test_a_campaign_that_is_killed_leaves_a_folder_of_its_own(tmp_path: Path) ->
 
 
 @contextmanager
-def end_results(started: Results) -> Iterator[None]:
-    yield
+def end_results(started: Results) -> Iterator[Results]:
+    yield started
     started.pytest_sessionfinish(cast("Any", None))
 
 
@@ -497,8 +595,9 @@ def test_a_folder_with_files_of_others_is_left_as_it_is(name: str, tmp_path: Pat
     file.parent.mkdir(exist_ok=True)
     file.write_text("{}", encoding="utf-8")
     config = cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None)))
-    with pytest.raises(InputError, match=f"--output must be a folder without {name.partition('/')[0]}"):
+    with pytest.raises(InputError, match=f"--output must be a folder without {name.partition('/')[0]}") as caught:
         Results(tmp_path, (), config)
+    assert ("unless --force is given" in str(caught.value)) == ("evidence" not in name)
     assert file.read_text(encoding="utf-8") == "{}"
     if "evidence" in name:
         with pytest.raises(InputError, match="--output must be a folder without evidence"):

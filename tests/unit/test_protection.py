@@ -11,6 +11,7 @@ from drivers.protection import Settings
 from drivers.protection.__main__ import act, parse
 from drivers.protection.monitor import Action
 from rig.base.errors import InputError, RefusedError
+from rig.serve.transport import DEFAULT_ENDPOINT
 from tests.unit import protection_scenarios
 from tests.unit.protection_mutants import MUTANTS, Mutant
 from tests.unit.protection_scenarios import SCENARIOS, sound
@@ -104,6 +105,15 @@ def test_impossible_settings_are_refused(field: str, changes: dict[str, Any]) ->
         Settings(**{"alert_um": 500.0, "danger_um": 1000.0, **changes})
 
 
+DEFAULTS = {
+    "alert_delay_s": 1.0, "danger_delay_s": 0.1, "hysteresis": 0.02, "window_s": 0.25, "corner_hz": 0.5,
+    "bias_v": -10.0, "scale_v_per_mm": 3.94, "ok_low_v": -17.5, "ok_high_v": -2.5, "ok_recovery_s": 30.0,
+    "latch_alert": False, "latch_danger": True, "startup_s": 1.0, "overspeed_hz": 0.0, "overspeed_turns": 3,
+    "speed_lost_s": 0.0, "reverse_turns": 0,
+}  # fmt: skip
+"""Settings without options: a changed one changes which alarms a user's monitor raises."""
+
+
 def test_each_setting_is_an_option() -> None:
     line = "zenoh:127.0.0.1:1 --alert-um 500 --danger-um 1500 --vote 2oo2 --bypass disk_x --no-latch-danger --trip stop"
     url, settings = parse(line.split())
@@ -111,6 +121,8 @@ def test_each_setting_is_an_option() -> None:
     assert settings == Settings(
         alert_um=500, danger_um=1500, vote="2oo2", bypass=("disk_x",), latch_danger=False, trip="stop"
     )
+    assert parse(["--alert-um", "1", "--danger-um", "1"])[0] == "zenoh:" + DEFAULT_ENDPOINT
+    assert DEFAULTS.items() <= Settings(alert_um=1, danger_um=1).model_dump().items()
     with pytest.raises(InputError, match=r"^overspeed_hz must be"):
         parse([*line.split(), "--overspeed-hz", "-1"])
 
