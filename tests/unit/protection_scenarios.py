@@ -142,6 +142,7 @@ def a_reset_ends_past_alarms(device: Any) -> None:
         ("reset", "danger disk_x", 300), ("reset", "trip", 300), ("alert", "disk_x", 350), ("danger", "disk_x", 351),
         ("trip", "danger disk_x", 351),
     ]  # fmt: skip
+    assert told(monitor.feed(samples(400, disk_x=np.zeros(100), disk_y=0.0)), "reset") == [], "it is used once"
 
 
 @scenario

@@ -147,6 +147,7 @@ def test_arguments_of_the_marker_are_commands_and_faults_at_their_times() -> Non
     expected = BenchSettings("hammer", channels=("disk_x",), commands=found.commands)
     assert found == expected
     assert (found.pace, found.block_ms, found.can, found.wait.join_s) == ("lockstep", 10.0, False, 30.0)
+    assert [None in each["request"].values() for each in found.document()["commands"]] == [False, False]
     for arguments, field in (
         ({"faults": [fault, {"channel": "disk_x"}]}, r"bench\.faults\.1"), ({"commands": [{}]}, r"bench\.commands\.0"),
         ({"block_ms": 0.5}, r"bench\.block_ms"), ({"duration_s": 0.0}, r"bench\.duration_s"),
@@ -199,7 +200,7 @@ def judge_device(folder: Path, *events: dict[str, Any], lost: Any = (), **change
     program = SimpleNamespace(status=0, last_line="", is_output_cut=False)
     device = SimpleNamespace(
         name="guard", rig_name="guard", program=program, is_ended_by_test=False, was_lost=False, may_end=False,
-        has_ended_early=False, bench=SimpleNamespace(**PARTS), end=lambda: None,
+        has_ended_early=False, changed_digests={}, bench=SimpleNamespace(**PARTS), end=lambda: None,
     )  # fmt: skip
     vars(device).update(changes)
     trial, end = Trial("a", folder=folder, records=folder), {"event": "end", "tick": 500_000}
@@ -225,6 +226,9 @@ def test_a_device_may_end_or_leave_early_only_if_that_is_allowed(tmp_path: Path)
     assert judge_device(tmp_path, lost=hangs) == {lost: (1.0, None)}
     assert judge_device(tmp_path, lost=hangs, is_ended_by_test=True) == {}
     assert judge_device(tmp_path, lost=hangs, is_ended_by_test=True, was_lost=True) == {lost: (1.0, None)}
+    assert judge_device(tmp_path, changed_digests={"a.py": "0", "b": "1"}) == {
+        "changed program files of guard": (2.0, None)
+    }
     program = SimpleNamespace(status=3, last_line="", is_output_cut=True, output_bytes=3e6, max_output_bytes=2e6)
     failed = {"exit status of guard": (3.0, None), "output of guard": (3.0, None)}
     assert judge_device(tmp_path, program=program) == failed
@@ -250,7 +254,10 @@ def test_files_of_devices_are_kept_up_to_their_limits(tmp_path: Path, monkeypatc
             (files / name).write_text(text)
         (files / "link").symlink_to("/etc/passwd")
         (records / "rig.log").write_text("log")
+        stopped = list[int]()
+        trial.record = cast("Any", SimpleNamespace(stop=lambda stopped=stopped: stopped.append(1), sha256="0a"))
         trial.close(failed=failed)
+        assert (stopped, trial.digests) == ([1], {"recording of x.py::case a": "0a"})
         assert not files.exists()
         assert not records.exists()
         if not (keeps or failed):

@@ -394,6 +394,12 @@ def test_the_page_lists_failures_first_then_changes(tmp_path: Path) -> None:
     )  # fmt: skip
     places = [page.index(words) for words in order]
     assert places == sorted(places)
+    assert page.count("x.campaign.toml::good</h") == 1
+    assert "x.py::skipped</h" not in page
+    for count, text in ((20, "`evidence/20`"), (22, "`evidence/20`, and 2 more")):
+        now["cases"][1]["evidence"] = [f"evidence/{number}" for number in range(1, count + 1)]
+        texts = [str(part) for part in make_page(now, tmp_path).parts]
+        assert any(each.rstrip("')").endswith(text) for each in texts), texts
 
 
 def test_the_sheet_has_identity_verdicts_digests_and_room_to_sign(tmp_path: Path) -> None:
