@@ -25,7 +25,7 @@ from replays.campaigns.equipment.bench import (
     UnsupportedError,
     toml_value,
 )
-from replays.campaigns.equipment.device import check_program
+from replays.campaigns.equipment.device import Device, check_program
 from replays.campaigns.equipment.record import Record, ReplacedRecordingError
 from replays.campaigns.evidence import MeasurementError, Trial
 from replays.campaigns.files.run import finish_run, note_early_ends
@@ -165,6 +165,29 @@ def test_a_program_or_script_that_is_missing_is_refused(tmp_path: Path) -> None:
     for words, must in ((["python", "no.py"], "whose script is there"), (["tol"], "that there is"), ([], "a command")):
         with pytest.raises(InputError, match=must):
             check_program(words, tmp_path, field="command")
+
+
+def test_changes_of_the_files_of_a_device_are_noted(tmp_path: Path) -> None:
+    script, words = tmp_path / "tool.py", "print('{name} {url} {{danger}}')"
+    for change in ("", "open('tool.py', 'a').write('#')", "import os; os.unlink('tool.py')"):
+        script.write_text(change)
+        stand_in = SimpleNamespace(**{**PARTS, "url": "u"}, joined=[], lost={"guard": "it hangs"})
+        device = Device(
+            ["python", "tool.py", words], name="guard", bench=cast("Any", stand_in), log=tmp_path / "guard.log",
+            where=tmp_path, files=tmp_path,
+        )  # fmt: skip
+        assert device.program.command == ["python", "tool.py", "print('guard u {danger}')"]
+        assert device.digests["tool.py"] == hashlib.sha256(change.encode()).hexdigest()
+        assert device.program.wait(60.0) == 0
+        with pytest.raises(BenchError, match="device guard ended with status 0: nothing"):
+            device.check_running()
+        by_test = not change
+        if by_test:
+            device.program.kill()
+        device.end()
+        assert (device.is_ended_by_test, device.was_lost) == (by_test, by_test)
+        expected = {"": {}, "o": {"tool.py": hashlib.sha256(f"{change}#".encode()).hexdigest()}}
+        assert device.changed_digests == expected.get(change[:1], {"tool.py": "removed"})
 
 
 def test_an_altered_recording_is_not_judged(tmp_path: Path) -> None:

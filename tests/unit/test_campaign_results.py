@@ -488,11 +488,11 @@ def test_a_truncated_recording_cannot_be_a_bench(tmp_path: Path) -> None:
 
 def test_two_campaigns_cannot_write_into_one_folder(tmp_path: Path) -> None:
     config = cast("Any", SimpleNamespace(option=SimpleNamespace(rig_sheet=None)))
-    first = Results(tmp_path / "out", (), config)
+    first = Results(tmp_path / "new/out", (), config)
     with pytest.raises(InputError, match=r"^--output must be a folder that no other running campaign writes to"):
-        Results(tmp_path / "out", (), config)
+        Results(tmp_path / "new/out", (), config)
     first.pytest_sessionfinish(cast("Any", None))
-    Results(tmp_path / "out", (), config).pytest_sessionfinish(cast("Any", None))
+    Results(tmp_path / "new/out", (), config).pytest_sessionfinish(cast("Any", None))
 
 
 def test_a_campaign_that_is_killed_leaves_a_folder_of_its_own(tmp_path: Path) -> None:
