@@ -44,11 +44,15 @@ PARTS = {
 """Fields of a bench without a rig."""
 
 
+LINES = {"listening on": "listening on 127.0.0.1:1;", "SLCAN adapter on ": "SLCAN adapter on /dev/pts/3"}
+"""Lines of a rig."""
+
+
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, str]]:
     """Return a function that starts a bench on a stand-in for a rig, and returns it with the rig's command line."""
     words = list[str]()
-    program = SimpleNamespace(wait_for=lambda *_: "listening on 127.0.0.1:1;", end=lambda: None)
+    program = SimpleNamespace(wait_for=lambda text, _: LINES[text], end=lambda: None)
     monkeypatch.setattr(bench, "Program", lambda command, _: (words.extend(command[1:]), program)[1])
 
     def start_bench(settings: BenchSettings, target: Target = DEFAULT_TARGET, **console: Any) -> tuple[Any, str]:
@@ -102,11 +106,12 @@ def test_the_command_of_a_rig_has_the_settings_of_its_case(
     ):
         found, command = start(settings)
         assert command == "-m rig run " + words.format(f"--listen 127.0.0.1:0 --name {found.name}")
-        assert found.url == "zenoh:127.0.0.1:1"
+        assert (found.url, found.slcan_path, found.can_url) == ("zenoh:127.0.0.1:1", None, None)
     monkeypatch.setattr(Bench, "scene_document", lambda _: SCENE)
     found, command = start(BenchSettings("hammer"), Target(replay=Path("a.mcap")))
     assert command == f"-m rig replay a.mcap --pause --listen 127.0.0.1:0 --name {found.name}"
-    found, command = start(BenchSettings(can=True))
+    found, command = start(BenchSettings(can=True), status=lambda: {"congestion": {}})
+    assert (found.slcan_path, found.links) == ("/dev/pts/3", 0)
     assert f" --can {found.can_url.partition(':')[2]} --can-socketcand {found.socketcand_url} --can-slcan" in command
     values = {"a": [1, True, "x"], "b": {"c": 0.5}}
     assert toml_value(values) == '{ "a" = [1, true, "x"], "b" = { "c" = 0.5 } }'
@@ -148,7 +153,10 @@ def test_arguments_of_the_marker_are_commands_and_faults_at_their_times() -> Non
     assert found == expected
     assert (found.pace, found.block_ms, found.can, found.wait.join_s) == ("lockstep", 10.0, False, 30.0)
     assert [None in each["request"].values() for each in found.document()["commands"]] == [False, False]
+    longest = read_settings({"block_ms": 1000.0, "duration_s": 86_400.0, "wait": {"join_s": 86_400.0}})
+    assert (longest.block_ms, longest.duration_s, longest.wait.join_s) == (1000.0, 86_400.0, 86_400.0)
     for arguments, field in (
+        ({"block_ms": 1000.5}, r"bench\.block_ms"), ({"wait": {"join_s": 86_401.0}}, r"bench\.wait\.join_s"),
         ({"faults": [fault, {"channel": "disk_x"}]}, r"bench\.faults\.1"), ({"commands": [{}]}, r"bench\.commands\.0"),
         ({"block_ms": 0.5}, r"bench\.block_ms"), ({"duration_s": 0.0}, r"bench\.duration_s"),
         ({"scene": "no"}, "scene"),

@@ -48,6 +48,7 @@ WRONG = {
     ),
     "pace": (HEAD + 'pace = "fast"\n' + PEAK, 3, "pace must be"),
     "block": (HEAD + "block_ms = 0\n" + PEAK, 3, "block_ms must be"),
+    "long block": (HEAD + "block_ms = 1000.5\n", 3, "block_ms must be less than or equal to 1000"),
     "nothing expected": (HEAD, 1, "expect must be"),
     "unknown signal": (
         HEAD + '[[expect]]\nmust = "<= 2 mm"\nsignal = "disk_z"\n',
@@ -357,7 +358,7 @@ RIGHT = (
 
 @pytest.mark.parametrize(("event", "where"), RIGHT)
 def test_fields_that_events_have_are_accepted(event: str, where: str, tmp_path: Path) -> None:
-    (case,) = load(tmp_path, HEAD + EVENT.format(event, where)).cases
+    (case,) = load(tmp_path, HEAD + "block_ms = 1000\n" + EVENT.format(event, where)).cases
     (expect,) = case.expects
     assert isinstance(expect, ExpectEvent)
     assert not [value for value in expect.where.values() if isinstance(value, dict)]
