@@ -34,7 +34,7 @@ class ZenohBus(NodeBus):
         endpoint: HOST:PORT of the hub, on 127.0.0.1; use `ssh -L` for a hub on another computer.
         connect_s: Longest wait for the hub [s].
         **settings: Settings of `NodeBus`: can_filters, receive_own_messages, fd, listen_only, rx_queue_size, bitrate,
-            data_bitrate, timing.
+            data_bitrate, timing; `in_order` is True by default.
 
     Raises:
         CanInitializationError: No hub of that channel replies, or its bus has other settings.
@@ -49,7 +49,7 @@ class ZenohBus(NodeBus):
         **settings: Any,
     ) -> None:
         self._address, self._connect_s = str(endpoint), connect_s
-        super().__init__(channel, **settings)
+        super().__init__(channel, in_order=settings.pop("in_order", True), **settings)
         # Last, so that rejoining a restarted hub cannot coincide with the first join.
         self.client.watch(codec.alive_key(self.channel), self._watch)
         self.channel_info = f"zenoh {self.channel} at {self._address}"

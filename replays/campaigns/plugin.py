@@ -99,15 +99,17 @@ class CampaignFile(pytest.File):
         except InputError as error:
             raise self.CollectError(str(error)) from None
         for case in campaign.cases:
-            yield CampaignItem.from_parent(self, name=case.id, case=case)
+            about = {"about": campaign.about, "cases_in_file": len(campaign.cases)}
+            yield CampaignItem.from_parent(self, name=case.id, case=case, about=about)
 
 
 class CampaignItem(pytest.Item):
     """A case of a campaign in TOML."""
 
-    def __init__(self, *, case: Case, **settings: Any) -> None:
+    def __init__(self, *, case: Case, about: dict[str, Any], **settings: Any) -> None:
         super().__init__(**settings)
         self.case = case
+        self.setup_document = {**about, **case.describe()}
 
     def setup(self) -> None:
         """Create the trial of the case."""
@@ -230,7 +232,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
             report.longrepr = report.longrepr if isinstance(item, CampaignItem) else str(error)
     if report.when == "teardown" and (trial := item.stash.get(_TRIAL, None)) is not None:
         title = item.case.title if isinstance(item, CampaignItem) else item.path.name
-        report.rig = {"title": title, **trial.document()}
+        setup = {"setup": item.setup_document} if isinstance(item, CampaignItem) else {}
+        report.rig = {"title": title, **setup, **trial.document()}
         if trial.kept:
             report.sections.append(("evidence", "\n".join(map(str, trial.kept))))
     return report

@@ -33,7 +33,7 @@ def render(report: Report) -> bytes:
             self.set_y(-12)
             self.set_font(_FONT, size=8)
             self.set_text_color(*_GREY)
-            self.cell(0, 6, f"{report.title}   {self.page_no()}", align="R")
+            self.cell(0, 6, f"{report.title}   {self.page_no()} / {{nb}}", align="R")
 
     pdf = _Pages(format="A4", unit="mm")
     # Without the date of writing, equal reports give equal files.

@@ -22,7 +22,7 @@ SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
     "drivers": 709,
-    "drivers/can": 4524,
+    "drivers/can": 4535,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
@@ -34,7 +34,7 @@ BUDGETS = {
     "recorder/output": 544,
     "recorder/viewer": 1896,
     "replays": 0,
-    "replays/campaigns": 3152,
+    "replays/campaigns": 3229,
     "replays/estimate": 337,
     "replays/player": 816,
     "replays/recordings": 10330,
@@ -45,7 +45,7 @@ BUDGETS = {
     "rig": 53,
     "rig/base": 947,
     "rig/channels": 2419,
-    "rig/cli": 5344,
+    "rig/cli": 5349,
     "rig/physics": 5479,
     "rig/run": 1843,
     "rig/serve": 2992,

@@ -210,7 +210,7 @@ def test_a_device_in_lockstep_gets_the_same_verdict_each_time(folder: Path) -> N
     assert "<img" in (folder / "out/index.html").read_text(encoding="utf-8")
     # A repeated run is identical, byte for byte.
     assert well["repeat"] == "rig campaign x.campaign.toml::how=well"
-    assert json.dumps(again).replace("how=again", "how=well") == json.dumps(well)
+    assert json.dumps(again).replace("how=again", "how=well").replace(" again", " well") == json.dumps(well)
 
 
 CAN_DEVICE = """

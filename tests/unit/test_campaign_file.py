@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from replays.campaigns.equipment.device import fill_placeholders
+from replays.campaigns.equipment.device import CAN_PLACES, fill_placeholders
 from replays.campaigns.files.campaign import Campaign, campaign_path, find_shipped, load_campaign, read_title
 from replays.campaigns.files.expectation import ExpectEvent
 from replays.campaigns.files.line_numbers import number_lines
@@ -118,9 +118,13 @@ WRONG = {
     "missing program": (
         HEAD + '[device]\ncommand = "protction {url}"\n' + PEAK,
         4,
-        "device.command must be a program that there is; received 'protction'",
+        "device.command must be a program in PATH, or a file relative to ",
     ),
-    "missing script": (HEAD + '[device]\ncommand = "python protction.py"\n' + PEAK, 4, "whose script is there"),
+    "missing script": (
+        HEAD + '[device]\ncommand = "python protction.py"\n' + PEAK,
+        4,
+        "a program with a script that exists in ",
+    ),
     "unknown place": (
         HEAD + '[device]\ncommand = "python -m json.tool {danger}"\n' + PEAK,
         4,
@@ -422,8 +426,13 @@ def test_device_and_limits_of_a_shipped_campaign_can_be_replaced(
     (found,) = case.devices
     assert (found.command, found.folder) == ("python mine.py {url} 0.15 2 mm", str(tmp_path))
     for name, device, limits, must in (
-        ("hammer", "python mine.py", [], "--device must be left out, as the campaign has no .device."),
-        ("protection-trip", "python other.py", [], "device.command must be a program whose script is there"),
+        ("hammer", "python mine.py", [], "--device must be left out, as the campaign has 0 devices, not one"),
+        (
+            "protection-trip",
+            "python other.py",
+            [],
+            "device.command must be a program with a script that exists in .*other.py",
+        ),
         (
             "protection-trip",
             None,
@@ -434,6 +443,29 @@ def test_device_and_limits_of_a_shipped_campaign_can_be_replaced(
     ):
         with pytest.raises(InputError, match=must):
             load_campaign(campaign_path(name), device, limits)
+
+
+def test_a_device_on_a_can_bus_replaces_the_device_of_any_campaign_with_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for place in CAN_PLACES:
+        (case,) = load_campaign(campaign_path("protection-latch"), f"true {{{place}}}").cases
+        assert case.bench.can
+        assert case.devices[0].command == f"true {{{place}}}"
+    (case,) = load_campaign(campaign_path("protection-latch"), "true {url}").cases
+    assert not case.bench.can
+    about = case.describe()
+    assert about["settings"]["command line of protection"] == "true {url}"
+    assert about["settings"]["alert"] == "500 um"
+    assert about["stimuli"][0].startswith("0.3 s: fault channel=disk_x kind=gain factor=2.6")
+    assert about["stimuli"][1] == "0.5 s: note acknowledged #reset"
+    file = tmp_path / "x.campaign.toml"
+    file.write_text(HEAD + '[[devices]]\ncommand = "true"\nname = "a"\n' + PEAK, encoding="utf-8")
+    assert [case.devices[0].name for case in load_campaign(file, "true {slcan}").cases] == ["a"]
+    file.write_text(HEAD + "".join(f'[[devices]]\ncommand = "true"\nname = "{n}"\n' for n in "ab") + PEAK, "utf-8")
+    with pytest.raises(InputError, match="as the campaign has 2 devices, not one"):
+        load_campaign(file, "true {url}")
 
 
 SHIPPED = {

@@ -23,7 +23,7 @@ from replays.campaigns.equipment.bench import Bench, BenchError, BenchSettings, 
 from replays.campaigns.evidence import Trial
 from replays.campaigns.files.campaign import find_shipped, load_campaign
 from replays.campaigns.files.case_results import CaseRecording
-from replays.campaigns.files.expectation import KINDS
+from replays.campaigns.files.expectation import KINDS, ExpectEvent
 from replays.campaigns.files.run import end_device, measure_end, run_repeatedly
 from replays.campaigns.measurement import Measurement, Must, judge_value
 from replays.campaigns.reporting.file_names import name_files
@@ -153,6 +153,20 @@ def test_a_level_is_exceeded_on_either_side(seen: CaseRecording) -> None:
     caused = one(seen, event="end", since=since, must="<= 1 s")
     assert (caused.level, caused.channels) == (0.5, ("disk_y",))
     assert caused.value == pytest.approx(0.6 - times_s[np.argmax(radius > 0.5)])
+
+
+def test_a_device_on_a_can_bus_has_its_name_of_the_campaign_too() -> None:
+    recording = cast("Any", SimpleNamespace(
+        catalogue={"tick_rate_hz": 1e6}, events=[{"event": "note", "tick": 1000, "from": "CAN 7", "tags": ["trip"]}]
+    ))  # fmt: skip
+    named = CaseRecording(recording, Path(), device_names={"CAN 7": "guard"})
+    trip: dict[str, Any] = {"event": "note", "must": "<= 1 s"}
+    measure = ExpectEvent(**trip, where={"from": "guard", "tags": "trip"}).measure
+    assert next(measure(named, {})).value == 0.001
+    other = next(measure(CaseRecording(recording, Path()), {}))
+    assert (other.good, other.note) == (False, "no note from=guard tags=trip occurred, only from CAN 7")
+    for sender, is_found in (("CAN 7", True), ("CAN 8", False)):
+        assert next(ExpectEvent(**trip, where={"from": sender}).measure(named, {})).good is is_found
 
 
 def test_a_scorecard_is_an_expectation(seen: CaseRecording) -> None:
@@ -423,6 +437,23 @@ def test_the_sheet_has_identity_verdicts_digests_and_room_to_sign(tmp_path: Path
         ("PASS", {}),
     ):  # fmt: skip
         assert make_sheet({**left, "counts": {**left["counts"], **counts}}, tmp_path, {}).lead.startswith(verdict)
+    setup = {"settings": {"command line of m": "m {url}", "alert": "5 um"}, "stimuli": ["0.1 s: hammer"],
+             "about": "About\nit", "cases_in_file": 5}  # fmt: skip
+    left["cases"] = [{**case, "setup": setup} for case in left["cases"]]
+    left["cases"][2]["setup"] = {**setup, "settings": {"alert": "6 um"}}
+    left["replaced_limits"], found["identity"] = ["alert=5 um"], {"firmware": "0.9"}
+    report = make_sheet(left, tmp_path, {"firmware": "1.0", "serial": "A7"}, found)
+    assert report.title == "Test sheet: T, serial A7"
+    lead = "INCONCLUSIVE: 3 passed; 2 of 5 cases of x.campaign.toml were not selected; limits replaced: alert=5 um."
+    assert report.lead == lead
+    write_report(report, tmp_path / "t.html")
+    page = " ".join(re.sub(r"<[^>]*>", " ", (tmp_path / "t.html").read_text(encoding="utf-8")).split())
+    for text in (
+        "firmware 0.9 1.0", "tested 2026-01-01T08:00:00 UTC 2026-01-01T08:00:00 UTC", "Settings About it",
+        "command line of m m {url} good, bad", "alert 5 um good, bad alert 6 um fresh", "Stimuli: 0.1 s: hammer.",
+        "peak 1.25 mm 0.9 mm &lt;= 1 mm",
+    ):  # fmt: skip
+        assert text in page, text
     folder = tmp_path / "evidence/good"
     (folder / "files").mkdir(parents=True)
     for file in (folder / "event.png", folder / "files/event.png", folder / "mine.png"):

@@ -101,6 +101,15 @@ def test_equal_identifiers_of_one_node_keep_their_order():
     assert [delivery.frame.data[0] for delivery in bus.advance(10 * MS)] == list(range(20))
 
 
+def test_a_node_that_keeps_the_order_takes_part_in_arbitration_with_its_oldest_frame():
+    bus = BusModel("1M")
+    a, b = bus.attach(in_order=True), bus.attach()
+    for identifier in (0x023, 0x300, 0x020):
+        bus.offer(a, Frame(identifier), 0)
+    bus.offer(b, Frame(0x100), 0)
+    assert [row.frame.identifier for row in bus.advance(10 * MS)] == [0x023, 0x100, 0x300, 0x020]
+
+
 def test_full_queue_drops_the_newest_and_counts():
     bus = BusModel("1M")
     a, _ = bus.attach(queue=3), bus.attach()

@@ -245,15 +245,17 @@ def test_stamps_are_the_ends_of_frames_by_the_wall_clock(rig: Rig) -> None:
     assert np.diff(stamps) == pytest.approx(duration, abs=1e-6)
 
 
-def test_the_lower_identifier_goes_first(rig: Rig) -> None:
-    sender, receiver = rig.bus(), rig.bus()
+def test_the_lower_identifier_goes_first_unless_a_node_keeps_the_order(rig: Rig) -> None:
+    sender, receiver = rig.bus(in_order=False), rig.bus()
     identifiers = list(range(0x7F0, 0x6F0, -1))
     sender.send_records(codec.make_records([message(item) for item in identifiers]))
     assert [item.arbitration_id for item in read(receiver, 256)] == sorted(identifiers)
+    rig.bus(in_order=True).send_records(codec.make_records([message(item) for item in identifiers]))
+    assert [item.arbitration_id for item in read(receiver, 256)] == identifiers
 
 
 def test_filters_hold_for_few_and_many_and_change_at_once(rig: Rig) -> None:
-    sender = rig.bus()
+    sender = rig.bus(in_order=False)
     receiver = rig.bus(can_filters=[{"can_id": 0x100, "can_mask": 0x7FE, "extended": False}])
     sender.send(message(0x102))
     sender.send(message(0x101))

@@ -380,6 +380,33 @@ def test_notes_and_commands_of_devices_on_a_bus_are_ordered_by_name_and_never_ho
     assert sent == [("CAN", 2.0), ("CAN 3", 3.0), ("CAN 7", 1.0)]
 
 
+def test_a_stop_that_a_device_has_announced_follows_its_notes() -> None:
+    message = default_messages().by_name["Device"]
+    stop = command_frame(CommandKind.STOP, 1)
+    with running() as rig, commands_of(rig) as commands:
+        for node in (3, 7):
+            commands.take(*device_frame(message, DeviceKind.JOIN, node))
+        until(lambda: len(rig.console.status()["devices"]) == 2)
+
+        def trip() -> None:
+            until(lambda: rig.console.status()["tick"] == BLOCK)
+            for kind in (NoteKind.DANGER, NoteKind.TRIP):
+                commands.take(*note_frame(message, kind, 7))
+            commands.take(*sender_frame(message, 7, stop[1]))
+            commands.take(*stop)
+            until(lambda: [row.started for row in commands.waiting] == [True, False, False])
+            commands.take(*device_frame(message, DeviceKind.DONE, 3, block=1))
+
+        thread = threading.Thread(target=trip)
+        thread.start()
+        with pytest.raises(RefusedError, match="a run that ended: stopped"):
+            rig.console.step(BLOCK)
+        thread.join(20.0)
+    events = [(each["event"], each.get("text") or each["command"]) for each in rig.listener.events
+              if each.get("from") == "CAN 7" and each["event"] != "device"]  # fmt: skip
+    assert events == [("note", "danger"), ("note", "trip"), ("command", "stop")]
+
+
 def test_an_invalid_note_on_a_bus_is_counted_and_has_no_effect() -> None:
     message = default_messages().by_name["Device"]
     with running() as rig, commands_of(rig) as commands:

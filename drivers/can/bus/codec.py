@@ -79,6 +79,7 @@ class JoinRequest(StrictModel):
 
     endpoint: Endpoint
     listen_only: bool = False
+    in_order: bool = False
     secret: Secret | None = None
 
 

@@ -46,6 +46,7 @@ class Endpoint:
         node: Its number in the model.
         joined_s: Time at which it joined [s, monotonic].
         listen_only: Whether it only listens.
+        in_order: Whether it sends its frames in the order of their offers.
         token: Whether its token has been seen, or it needs none.
         secret: Secret that proves that its name is its own.
         offered: Number of frames that it has offered.
@@ -61,6 +62,7 @@ class Endpoint:
     node: int
     joined_s: float
     listen_only: bool
+    in_order: bool
     token: bool
     secret: str
     offered: int = 0
@@ -142,7 +144,8 @@ class Endpoints:
         if local is None:
             self._make_room(token=token)
         secret = _new_secret() if local is None else local.secret
-        endpoint = Endpoint(name, self._new_number(), -1, time.monotonic(), request.listen_only, token, secret)
+        settings = (request.listen_only, request.in_order)
+        endpoint = Endpoint(name, self._new_number(), -1, time.monotonic(), *settings, token, secret)
         self._by_name[name] = endpoint
         self._attach(endpoint)
         return endpoint
@@ -221,7 +224,8 @@ class Endpoints:
         self._detach(endpoint)
 
     def _attach(self, endpoint: Endpoint) -> None:
-        node = endpoint.node = self._model.attach(endpoint.name, queue=QUEUE_FRAMES, listen_only=endpoint.listen_only)
+        settings = {"listen_only": endpoint.listen_only, "in_order": endpoint.in_order}
+        node = endpoint.node = self._model.attach(endpoint.name, queue=QUEUE_FRAMES, **settings)
         self._by_node[node] = endpoint
         self.numbers[node] = endpoint.number
 

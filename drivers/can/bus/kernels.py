@@ -31,7 +31,8 @@ ATTACHED, LISTENING, CAPACITY = 0, 1, 2
 TEC, REC, STATE, COUNT, HEAD, SUSPENDED, LEFT, RECOVERING, QUIET = 3, 4, 5, 6, 7, 8, 9, 10, 11
 DISTURBED, DISTURBED_BIT = 12, 13
 SENT, ERRORS, DROPPED, REFUSED, BUS_OFFS = 14, 15, 16, 17, 18
-NODE_COLUMNS = 19
+IN_ORDER = 19
+NODE_COLUMNS = 20
 
 ACTIVE, PASSIVE, OFF = 0, 1, 2
 
@@ -344,14 +345,14 @@ def _store_result(out, count, slot, start, end, outcome, slots, final):
 
 @njit(cache=True, error_model="numpy")
 def _find_head(bus, node):
-    """Find the frame that the node sends next: by priority; equal ones keep their order."""
+    """Find the frame that the node sends next: by priority, unless it keeps the order; equal ones keep theirs."""
     head = np.int64(-1)
     for k in range(bus.nodes[node, COUNT]):
         s = bus.queues[node, k]
         if head < 0:
             head = s
             continue
-        key, best = bus.slots[s, KEY], bus.slots[head, KEY]
+        key, best = (0, 0) if bus.nodes[node, IN_ORDER] else (bus.slots[s, KEY], bus.slots[head, KEY])
         if key < best or (key == best and bus.slots[s, SEQUENCE] < bus.slots[head, SEQUENCE]):
             head = s
     bus.nodes[node, HEAD] = head
@@ -400,7 +401,7 @@ def _admit(bus, out, count):
     bus.queues[n, nodes[n, COUNT]] = s
     nodes[n, COUNT] += 1
     head = nodes[n, HEAD]
-    if head < 0 or bus.slots[s, KEY] < bus.slots[head, KEY]:
+    if head < 0 or (nodes[n, IN_ORDER] == 0 and bus.slots[s, KEY] < bus.slots[head, KEY]):
         nodes[n, HEAD] = s
     return count
 

@@ -93,14 +93,18 @@ class BusModel:
         """Time up to which the bus was advanced [ns]."""
         return int(self._bus.cells[kernels.NOW])
 
-    def attach(self, name: str = "", *, queue: int = 64, listen_only: bool = False) -> int:
-        """Add a node. It sends its highest priority first, as a controller with buffers does.
+    def attach(
+        self, name: str = "", *, queue: int = 64, listen_only: bool = False, in_order: bool = False
+    ) -> int:  # fmt: skip
+        """Add a node.
 
         Args:
             name: Name in messages.
             queue: Capacity of the transmit queue [frames], including the one on the wire; frames beyond it are dropped
                 and counted.
             listen_only: Whether it sends nothing, not even acknowledges.
+            in_order: Whether it sends its frames in the order of their offers, as an operating system's transmit queue
+                does; otherwise the highest priority first, as a controller with buffers does.
 
         Returns:
             Its number.
@@ -126,6 +130,7 @@ class BusModel:
         row[:] = 0
         row[kernels.ATTACHED] = 1
         row[kernels.LISTENING] = listen_only
+        row[kernels.IN_ORDER] = in_order
         row[kernels.CAPACITY] = queue
         row[kernels.HEAD] = -1
         return node

@@ -42,6 +42,7 @@ class NodeBus(can.BusABC):
         fd: None for the setting of the hub's bus; True requires CAN FD; False makes this a classic node, which receives
             no FD frames and cannot send any.
         listen_only: Send nothing and acknowledge nothing.
+        in_order: Send frames in their order, as an operating system's transmit queue does, not by priority.
         rx_queue_size: Number of frames that wait to be read; beyond it the oldest are dropped, and an error frame
             reports it.
         bitrate: If given, must equal that of the hub's bus [bit/s].
@@ -57,6 +58,7 @@ class NodeBus(can.BusABC):
         receive_own_messages: bool = False,
         fd: bool | None = None,
         listen_only: bool = False,
+        in_order: bool = False,
         rx_queue_size: int = _RECEIVE_QUEUE,
         bitrate: int | None = None,
         data_bitrate: int | None = None,
@@ -67,7 +69,7 @@ class NodeBus(can.BusABC):
         self.name = f"{os.getpid()}-{next(_numbers)}-{os.urandom(3).hex()}"
         self.receive_own_messages = bool(receive_own_messages)
         self._fd_asked = fd
-        self._listen_only = bool(listen_only)
+        self._listen_only, self._in_order = bool(listen_only), bool(in_order)
         self._rates = _bit_rates(bitrate, data_bitrate, timing)
         self._queue_size = max(1, int(rx_queue_size))
         self._lock = threading.Lock()
@@ -134,7 +136,8 @@ class NodeBus(can.BusABC):
         """
         again = {} if self.secret is None else {"secret": self.secret}
         try:
-            answer = check(codec.JoinReply, self._ask("join", {"listen_only": self._listen_only, **again}), field="hub")
+            settings = {"listen_only": self._listen_only, "in_order": self._in_order}
+            answer = check(codec.JoinReply, self._ask("join", {**settings, **again}), field="hub")
         except InputError as error:
             raise can.CanInitializationError(f"{self._where()} refuses another node: {error}") from None
         rates = {"bitrate": answer.nominal_bit_s, "data_bitrate": answer.data_bit_s}

@@ -149,6 +149,8 @@ class Commands:
         # A device's frame may have to wait for its earlier ones: its time begins when it is sent.
         deadline_s = math.inf if device else self._now() + self._timeout_s
         item = _PendingCommand(command, deadline_s, device, ordered)
+        # A stop waits for earlier notes of the device that has announced it, and for nothing else.
+        is_sent_at_once = command.kind is CommandKind.STOP and not ordered
         with self._work:
             if len(self.waiting) >= _MAX_PENDING:
                 self._refuse(Result.BUSY, command)
@@ -156,11 +158,10 @@ class Commands:
             if isinstance(command, Command):
                 # The counter is used up whatever the rig replies, so that the same frame is not accepted twice.
                 self.counter = command.counter
-            item.started = command.kind is CommandKind.STOP
+            item.started = is_sent_at_once
             self.waiting.append(item)
             self._work.notify_all()
-        if command.kind is CommandKind.STOP:
-            # A stop does not wait for other commands.
+        if is_sent_at_once:
             self._send_aside(item)
 
     def send_all(self) -> None:

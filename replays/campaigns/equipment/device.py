@@ -177,7 +177,7 @@ def check_program(words: Sequence[str], where: Path, *, field: str) -> None:
     beside = str(Path(sys.executable).parent)
     program = shutil.which(words[0]) or shutil.which(words[0], path=beside) or (where / words[0]).is_file()
     if not program:
-        raise InputError(field, "a program that there is", words[0])
+        raise InputError(field, f"a program in PATH, or a file relative to {where.absolute()}", words[0])
     scripts = [word for word in words[1:2] if word.endswith(".py")]
     if scripts and not (where / scripts[0]).is_file():
-        raise InputError(field, "a program whose script is there", scripts[0])
+        raise InputError(field, f"a program with a script that exists in {where.absolute()}", scripts[0])

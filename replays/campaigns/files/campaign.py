@@ -114,6 +114,14 @@ class Step:
     note: str = ""
     tags: tuple[str, ...] = ()
 
+    def describe(self) -> str:
+        """Return the step as text, such as "0.4 s: fault channel=disk_x kind=hum amplitude_v=3"."""
+        if self.command is None:
+            return " ".join([f"{self.at_s:g} s: note {self.note}", *(f"#{tag}" for tag in self.tags)])
+        values = {"command": "", **self.command.request.request()}
+        shown = [f"{name}={value}" for name, value in values.items() if name != "command" and value is not None]
+        return " ".join([f"{self.at_s:g} s: {self.command.request.command}", *shown])
+
 
 @dataclass(frozen=True)
 class Case:
@@ -129,6 +137,8 @@ class Case:
         devices: Devices under test, in the order of their start; without one the rig runs alone.
         expects: Expectations.
         axes: Values on the axes of the matrix, by axis.
+        limits: Limits as text, by name.
+        device_commands: Command lines of the devices with their placeholders.
     """
 
     id: str
@@ -140,6 +150,13 @@ class Case:
     devices: tuple[_Device, ...]
     expects: tuple[Expect, ...]
     axes: Mapping[str, str]
+    limits: Mapping[str, str]
+    device_commands: tuple[str, ...]
+
+    def describe(self) -> dict[str, Any]:
+        """Return settings and stimuli of the case for a sheet: texts that are the same in every run."""
+        settings = {f"command line of {each.name}": each.command for each in self.devices}
+        return {"settings": {**settings, **self.limits}, "stimuli": [each.describe() for each in self.steps]}
 
 
 @dataclass(frozen=True)
@@ -210,10 +227,11 @@ def load_campaign(
         file = check(_File, document, field="")
         written = file
         if device is not None:
-            if file.device is None:
-                raise InputError("--device", "left out, as the campaign has no [device]", device)
-            own = file.device.model_copy(update={"command": device, "folder": str(Path.cwd())})
-            file = file.model_copy(update={"device": own})
+            if len(known := [file.device] if file.device else file.devices) != 1:
+                raise InputError("--device", f"left out, as the campaign has {len(known)} devices, not one", device)
+            own = known[0].model_copy(update={"command": device, "folder": str(Path.cwd())})
+            can = file.can or any(f"{{{place}}}" in device for place in CAN_PLACES)
+            file = file.model_copy(update={"device": own, "devices": [], "can": can})
         cases = tuple(_cases(path, _replace_limits(file, limits), max_cases))
         ids: set[str] = set()
         for case in cases:
@@ -357,7 +375,10 @@ def _case(
         wait=file.wait,
     )
     ordered = tuple(sorted(steps, key=lambda step: step.at_s))
-    return Case(name, file.title, path, bench, duration_s, ordered, devices, tuple(expects), axis_labels)
+    written = tuple(each.command for each in (file.device, *file.devices) if each is not None)
+    return Case(
+        name, file.title, path, bench, duration_s, ordered, devices, tuple(expects), axis_labels, limits, written
+    )  # fmt: skip
 
 
 _TRUTH: Units = {

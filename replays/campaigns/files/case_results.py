@@ -42,11 +42,13 @@ class CaseRecording:
         recording: All that the rig sent.
         folder: Folder with the files of the device under test.
         origin_s: Simulated time at which the case began [s].
+        device_names: Names of the devices in the campaign, by those on a CAN bus, such as "CAN 7".
     """
 
     recording: Recording
     folder: Path
     origin_s: float = 0.0
+    device_names: Mapping[str, str] = field(default_factory=dict)
     _cards: dict[tuple[Any, ...], Scorecard] = field(default_factory=dict)
     _rows: dict[tuple[str, tuple[str, ...]], Samples] = field(default_factory=dict)
 

@@ -90,16 +90,26 @@ class EventOf(Written):
 
     def times_s(self, recording: CaseRecording) -> list[float]:
         """Return the times of the event, from the start of the case [s]."""
-        return [time_s for time_s, event in recording.events if self._matches(event)]
+        return [time_s for time_s, event in recording.events if self.matches(event, recording.device_names)]
 
-    def _matches(self, event: Mapping[str, Any]) -> bool:
+    def list_senders(self, recording: CaseRecording) -> str:
+        """Return who sent such events, whatever `from` is; empty if there are none, or if `from` is not compared."""
+        if "from" not in self.where:
+            return ""
+        any_sender = {name: value for name, value in self.where.items() if name != "from"}
+        of, events = self.model_copy(update={"where": any_sender}), recording.events
+        return ", ".join(sorted({str(event["from"]) for _, event in events if of.matches(event, {})}))
+
+    def matches(self, event: Mapping[str, Any], device_names: Mapping[str, str]) -> bool:
+        """Return whether an event is selected; `from` compares both names of a device on a CAN bus."""
         if event.get("event") != self.event or self.text not in str(event.get("text", "")):
             return False
         for name, wanted in self.where.items():
             place: Any = event
             for part in name.split("."):
                 place = place.get(part) if isinstance(place, Mapping) else None
-            if place != wanted and not (isinstance(place, list) and wanted in place):
+            sender = device_names.get(str(place)) if name == "from" else place
+            if wanted not in (place, sender) and not (isinstance(place, list) and wanted in place):
                 return False
         return True
 
@@ -305,6 +315,8 @@ class ExpectEvent(_Within):
         # The origin causes the event, so an event before the origin is a different one.
         at_s = next((each for each in times_s if not each < since_s), math.nan)
         note = "" if math.isfinite(at_s) else f"no {self.of} occurred"
+        if note and not times_s and (senders := self.of.list_senders(recording)):
+            note += f", only from {senders}"
         if note and times_s:
             note += f" after {since_s:g} s; {len(times_s)} before, at {_list_times(times_s)}"
         note = "the origin of the time never occurred" if math.isnan(since_s) else note

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -114,7 +115,8 @@ def finish_run(trial: Trial) -> CaseRecording:
     for device in trial.devices:
         end_device(device, trial)
     trial.recording = trial.record.stop()  # no device can alter it any more
-    results = CaseRecording(trial.recording, trial.folder, trial.origin_s)
+    names = {device.rig_name: device.name for device in trial.devices}
+    results = CaseRecording(trial.recording, trial.folder, trial.origin_s, names)
     for device in trial.devices:
         _measure_device(device, results, trial, lost)
     if trial.devices and not trial.has_folder():
@@ -261,7 +263,8 @@ def list_findings(trial: Trial, error: BaseException | None = None) -> dict[str,
         is_of_bench = isinstance(error, BenchError | ConnectionError | TimeoutError)
         found["error"] = [trial.mask_addresses(str(error)) if is_of_bench else type(error).__name__]
     for each in trial.measurements:
-        value = f"{with_unit(repr(each.value), each.must.unit)}, " if in_lockstep else ""
+        number = "nothing" if math.isnan(each.value) else with_unit(repr(each.value), each.must.unit)
+        value = f"{number}, " if in_lockstep else ""
         found.setdefault(each.name, []).append(f"{value}{each.outcome.value}")
     return found
 

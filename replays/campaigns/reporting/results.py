@@ -15,6 +15,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from pydantic import Field
+
 from replays.campaigns.equipment.cleanup import find_containment
 from replays.report import junit, write_report
 from replays.studies.common import provenance
@@ -45,6 +47,7 @@ class _EarlierMeasurement(StrictModel, extra="ignore"):
     name: str
     unit: str
     margin: float | None
+    value: float | None = None
 
 
 class _EarlierCase(StrictModel, extra="ignore"):
@@ -67,6 +70,7 @@ class _EarlierResults(StrictModel, extra="ignore"):
 
     cases: list[_EarlierCase]
     wall: _EarlierWall
+    identity: dict[str, str] = Field(default={})
 
 
 class Results:
@@ -132,7 +136,7 @@ class Results:
     def _case(self, name: str) -> dict[str, Any]:
         return self._cases.setdefault(name, {
             "outcome": "interrupted", "reason": "", "duration_s": 0.0, "title": "", "measurements": [],
-            "evidence": [], "bench": None, "resolution": "", "troubles": [],
+            "evidence": [], "bench": None, "setup": {}, "resolution": "", "troubles": [],
             "floor_ms": None, "late_blocks": 0, "digests": {},
         })  # fmt: skip
 
@@ -146,11 +150,10 @@ class Results:
 
         write_report(make_page(document, self._folder, self._earlier), self._folder / "index.html")
         for sheet in self._config.option.rig_sheet or ():
-            from replays.campaigns.reporting.sheet import make_sheet, parse_identity
+            from replays.campaigns.reporting.sheet import make_sheet
 
-            identity = parse_identity(self._config.option.rig_identity or [])
             as_found = self._earlier[0] if self._earlier else None
-            write_report(make_sheet(document, self._folder, identity, as_found), Path(sheet))
+            write_report(make_sheet(document, self._folder, document["identity"], as_found), Path(sheet))
         os.close(self._lock)
 
     def _write_results(self) -> dict[str, Any]:
@@ -160,6 +163,8 @@ class Results:
 
     def document(self) -> dict[str, Any]:
         """Return the results as a JSON document."""
+        from replays.campaigns.reporting.sheet import parse_identity
+
         cases, wall = [], {}
         # Parallel workers finish in any order; the planned order is always the same.
         for name in [*self._planned, *(name for name in self._cases if name not in self._planned)]:
@@ -174,6 +179,8 @@ class Results:
         titles = list(dict.fromkeys(case["title"] for case in cases if case["title"]))
         return replace_nonfinite({
             "format": FORMAT, "titles": titles, "counts": counts, "cases": cases,
+            "identity": parse_identity(getattr(self._config.option, "rig_identity", None) or []),
+            "replaced_limits": getattr(self._config.option, "rig_limit", None) or [],
             "wall": {
                 "begun": datetime.fromtimestamp(self._begun_s, UTC).strftime("%Y-%m-%dT%H:%M:%S"),
                 "duration_s": round(time.time() - self._begun_s, 3), "machine": provenance.machine(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -65,35 +66,50 @@ def make_sheet(
         identity: Fields of the identity by name; missing ones are left open to be filled in by hand.
         as_found: Results of the first campaign on this device, before it was adjusted.
     """
+    cases, found = results["cases"], as_found or {"cases": (), "identity": {}, "wall": {}}
+    earlier = {case["id"]: case for case in found["cases"]}
+    has_earlier = as_found is not None
     counts, wall = results["counts"], results["wall"]
     mark = judge_counts(counts)
-    if mark == "good" and counts["skipped"]:
+    missing = _find_missing(results)
+    if mark == "good" and (counts["skipped"] or missing):
         mark = "open"  # a sheet of a test that is not complete
     verdict = {"good": "PASS", "bad": "FAIL", "open": "INCONCLUSIVE"}[mark]
-    title = f"Test sheet: {'; '.join(results['titles'])}"
-    report = Report(title, f"{verdict}: {summarize_counts(counts)}.", mark=mark)
+    serial = f", serial {identity['serial']}" if "serial" in identity else ""
+    title = f"Test sheet: {'; '.join(results['titles'])}{serial}"
+    replaced = ", ".join(results.get("replaced_limits", ()))
+    lead = "; ".join([summarize_counts(counts), *missing, *([f"limits replaced: {replaced}"] if replaced else [])])
+    report = Report(title, f"{verdict}: {lead}.", mark=mark)
     report.heading("Identity")
     fields = {name: identity.get(name, _LINE) for name in IDENTITY} | dict(identity)
     origin = {"tested": f"{wall['begun']} UTC", "machine": wall["machine"], "rig": wall["rig"]}
-    report.table(("field", "text"), [*fields.items(), *origin.items()])
+    before = {**found.get("identity", {}), "tested": f"{found['wall'].get('begun')} UTC"} if has_earlier else {}
+    headings = ("field", *(["as found", "as left"] if has_earlier else ["text"]))
+    report.table(headings, [
+        (name, *([before.get(name, "")] if has_earlier else []), text) for name, text in {**fields, **origin}.items()
+    ])  # fmt: skip
     versions = ", ".join(f"{name} {number}" for name, number in provenance.versions(*_LIBRARIES).items())
     report.text(f"Versions: {versions}. The virtual rig's sensor calibrations are assumed values.")
+    _add_settings(report, results)
     report.heading("Verdicts")
-    earlier = {case["id"]: case["outcome"] for case in (as_found or {"cases": ()})["cases"]}
-    headings = ("case", "as found", "as left") if as_found is not None else ("case", "verdict")
+    headings = ("case", "as found", "as left") if has_earlier else ("case", "verdict")
     report.table(headings, [
-        Row((case["id"], *([earlier.get(case["id"], "not tested")] if as_found is not None else []), case["outcome"]),
-            CASE_MARKS[case["outcome"]])
-        for case in results["cases"]
+        Row((case["id"], *([earlier.get(case["id"], {}).get("outcome", "not tested")] if has_earlier else []),
+             case["outcome"]), CASE_MARKS[case["outcome"]])
+        for case in cases
     ])  # fmt: skip
     report.heading("Measurements")
-    for case in results["cases"]:
+    values = ("as found", "as left") if has_earlier else ("value",)
+    for case in cases:
         report.heading(case["id"], level=2)
         if case["reason"]:
             report.text(case["reason"])
-        report.table(("measurement", "value", "must be", "source", "verdict"), [
-            Row((each["name"], format_number(each["value"], each["unit"], "nothing"), format_limit(each),
-                 each["source"], each["outcome"]), OUTCOME_MARKS[each["outcome"]])
+        if stimuli := case.get("setup", {}).get("stimuli"):
+            report.text(f"Stimuli: {'; '.join(stimuli)}.")
+        old = {each["name"]: _format_value(each) for each in earlier.get(case["id"], {}).get("measurements", ())}
+        report.table(("measurement", *values, "must be", "source", "verdict"), [
+            Row((each["name"], *([old.get(each["name"], "")] if has_earlier else []), _format_value(each),
+                 format_limit(each), each["source"], each["outcome"]), OUTCOME_MARKS[each["outcome"]])
             for each in case["measurements"]
         ])  # fmt: skip
         add_picture(report, case, folder, f"Signals and events: {case['id']}.")
@@ -105,3 +121,36 @@ def make_sheet(
         ("", "name", "date", "signature"), [(who, _LINE, _LINE, _LINE) for who in ("tested by", "approved by")]
     )
     return report
+
+
+def _format_value(each: Document) -> str:
+    return format_number(each.get("value"), each["unit"], "nothing")
+
+
+def _find_missing(results: Document) -> list[str]:
+    """Return which files have cases that were not run, in words."""
+    counts: Counter[str] = Counter()
+    totals: dict[str, int] = {}
+    for case in results["cases"]:
+        file = case["id"].partition("::")[0]
+        counts[file] += 1
+        totals[file] = case.get("setup", {}).get("cases_in_file", 0)
+    return [f"{total - counts[file]} of {total} cases of {file} were not selected"
+            for file, total in totals.items() if counts[file] < total]  # fmt: skip
+
+
+def _add_settings(report: Report, results: Document) -> None:
+    """Add what the campaigns are about, command lines of devices, and limits, each with its cases."""
+    setups = {case["id"]: case.get("setup", {}) for case in results["cases"]}
+    rows: dict[tuple[str, str], list[str]] = {}
+    for name, setup in setups.items():
+        for setting in setup.get("settings", {}).items():
+            rows.setdefault(setting, []).append(name.partition("::")[2])
+    if not rows:
+        return
+    report.heading("Settings")
+    for about in dict.fromkeys(setup.get("about", "") for setup in setups.values()):
+        if about:
+            report.text(" ".join(about.split()))
+    shown = [(*row, "all" if len(names) == len(setups) else ", ".join(names)) for row, names in rows.items()]
+    report.table(("setting", "value", "cases"), shown)

@@ -60,7 +60,9 @@ def campaign(
     ] = None,
     sheet: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="Write a sheet to hand in, .html or .pdf, with evidence of all cases"),
+        typer.Option(
+            metavar="FILE", help="Write a sheet to hand in, .html or .pdf, with evidence of each case; repeatable"
+        ),
     ] = None,
     identity: Annotated[
         list[str] | None,
@@ -139,6 +141,8 @@ def _list_cases(files: list[str], cases: Sequence[Case], repeat: int) -> None:
     for name in (file.partition("::")[0] for file in files):
         if not name.endswith(SUFFIX):
             echo(f"{name}: tests of pytest; list them by pytest --collect-only")
+    for command in dict.fromkeys(command for case in cases for command in case.device_commands):
+        echo(f"device: {' '.join(command.split())}")
     for case in cases:
         echo(f"{case.file.name}::{case.id}  {case.duration_s:g} s")
     simulated_s = sum(case.duration_s for case in cases)
@@ -148,7 +152,8 @@ def _list_cases(files: list[str], cases: Sequence[Case], repeat: int) -> None:
     echo(f"{len(cases)} cases, {simulated_s:g} s simulated{f', of these {real_s:g} s in real time' if real_s else ''}")
     echo(
         f"estimate: {processor_s:.0f} s of processor time{f' for {repeat} runs' if repeat > 1 else ''} "
-        f"({_CASE_S:g} s for a case, {_SIMULATED_S:g} s for a simulated second, {1e3 * _BLOCK_S:g} ms for a block)"
+        f"({_CASE_S:g} s for a case, {_SIMULATED_S:g} s for a simulated second, {1e3 * _BLOCK_S:g} ms for a block); "
+        "the first run also compiles"
     )
 
 

@@ -74,7 +74,7 @@ def hub(
             with reporting(compiles=True):
                 for can_hub in hubs:
                     stack.enter_context(can_hub)
-            buses = {can_hub.channel: partial(HubBus, can_hub) for can_hub in hubs}
+            buses = {can_hub.channel: partial(HubBus, can_hub, in_order=True) for can_hub in hubs}
             outlets = stack.enter_context(CanOutlets(buses, rates, socketcand=socketcand, slcan=slcan))
             for line in outlets.lines():
                 echo(f"rig: {line}", err=True)

@@ -265,7 +265,7 @@ class CanOutput:
             Hub(BusModel(self.speed), self.channel, server) as hub,
             HubBus(hub) as bus,
         ):
-            self._hub, self._open_more = hub, partial(HubBus, hub)
+            self._hub, self._open_more = hub, partial(HubBus, hub, in_order=True)
             yield bus
 
 
