@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,7 @@ class Must:
         if match is None:
             raise InputError(field, "a comparison with a number and its unit, such as '<= 1.2 mm' or '4 to 6 Hz'", text)
         op, one, low, high, unit = match.groups()
+        _check_finite([float(each) for each in (one, low, high) if each is not None], field, text)
         if op is not None:
             return cls(op, float(one), unit or "1")
         if not float(low) <= float(high):
@@ -66,6 +68,7 @@ class Must:
         scale = _factor(self.unit, unit, field=field, of=of, text=str(self))
         limit = self.limit
         scaled = (limit[0] * scale, limit[1] * scale) if isinstance(limit, tuple) else limit * scale
+        _check_finite(scaled if isinstance(scaled, tuple) else [scaled], field, str(self))
         return Must(self.op, limit if scale == 1.0 else scaled, unit)
 
     def __str__(self) -> str:
@@ -84,9 +87,29 @@ class Must:
         return float(f"{margin:.12g}") + 0.0  # drops -0 and rounding errors of the subtraction
 
     def holds(self, value: float) -> bool:
-        """Return whether a value is within the limit; NaN is not."""
+        """Return whether a value is within the limit; NaN and infinity are not."""
         margin = self.margin(value)
-        return margin > 0.0 if self.op in ("<", ">", "!=") else margin >= 0.0
+        return math.isfinite(value) and (margin > 0.0 if self.op in ("<", ">", "!=") else margin >= 0.0)
+
+    def check_decides(self, *, whole: bool, field: str, of: str) -> None:
+        """Check that some values from 0 on are within the limit and some are not.
+
+        Args:
+            whole: Whether the values are whole numbers.
+            field: Field named in errors.
+            of: What is measured, named in errors.
+
+        Raises:
+            InputError: If all values are within the limit, or none is.
+        """
+        places = [0.0, 1e300]
+        for limit in self.limit if isinstance(self.limit, tuple) else (self.limit,):
+            down, up = (math.floor(limit), math.ceil(limit)) if whole else (limit, limit)
+            step = 1.0 if whole else 1e-6 * abs(limit)
+            places += [down - step, down, up, up + step]
+        if len({self.holds(place) for place in places if place >= 0.0}) == 1:
+            what = "a whole number from 0 on" if whole else "at least 0"
+            raise InputError(field, f"a limit that decides, as {of} is {what}", str(self))
 
 
 @dataclass(frozen=True)
@@ -191,7 +214,13 @@ def split_quantity(text: str, *, field: str) -> tuple[float, str]:
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise InputError(field, "a number with its unit, such as '0.2 mm'", text)
+    _check_finite([float(match[1])], field, text)
     return float(match[1]), (match[2] or "1").strip()
+
+
+def _check_finite(numbers: Iterable[float], field: str, text: object) -> None:
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(field, "with finite numbers only", text)
 
 
 def _factor(unit: str, wanted: str, *, field: str, of: str, text: str) -> float:
@@ -230,5 +259,6 @@ def judge_value(
         raise InputError("limit", must, Words(f"{limit!r}, and a value of {value!r}")) from None
     if isinstance(numbers, tuple) and (len(numbers) != 2 or not numbers[0] <= numbers[1]):
         raise InputError("limit", "two numbers, the lower first", limit)
+    _check_finite(numbers if isinstance(numbers, tuple) else [numbers], "limit", limit)
     must = Must(op, numbers, unit_of_limit or unit).convert_to(unit or "1", field="unit_of_limit", of=name)  # type: ignore[arg-type]
     return Measurement(name, value, must, **fields)

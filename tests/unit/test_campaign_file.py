@@ -348,6 +348,50 @@ WRONG = {
         6,
         "expect.when.scene must be a value or a list of values",
     ),
+    "limit without end": (HEAD + PEAK.replace("2 mm", "1e999 mm"), 5, "must must be with finite numbers only"),
+    "level without end": (
+        HEAD + PEAK.replace("2 mm", "1 s") + 'take = "time beyond"\nbeyond = "1e999 mm"\n',
+        7,
+        "finite",
+    ),
+    "level below zero": (
+        HEAD + PEAK.replace("2 mm", "1 s") + 'take = "first beyond"\nbeyond = "-1 mm"\n',
+        7,
+        "at least 0",
+    ),
+    "limit that all values meet": (
+        HEAD + PEAK.replace("<= 2", ">= 0"),
+        5,
+        "a limit that decides, as peak of disk_x is",
+    ),
+    "limit that no value meets": (HEAD + PEAK.replace("<= 2", "<= -2"), 5, "a limit that decides"),
+    "limit that all numbers meet": (
+        HEAD + '[[expect]]\nevent = "note"\ntake = "count"\nmust = "!= 0.5"\n',
+        6,
+        "must be a limit that decides, as number of note is a whole number from 0 on",
+    ),
+    "window of a moment": (
+        HEAD + PEAK + 'take = "value"\nat_s = 1.0\nto_s = 0.5\n',
+        8,
+        "expect.to_s must be left out with at_s",
+    ),
+    "window within a block": (
+        HEAD + EVENT.format("note", "") + "from_s = 0.501\nto_s = 0.509\n",
+        8,
+        "expect.to_s must be after a multiple of block_ms since from_s",
+    ),
+    "text of two lines": (HEAD + EVENT.format("note", "") + 'text = "a\\nb"\n', 7, "expect.text must be a line"),
+    "note of the campaign itself": (
+        HEAD + 'steps = [{ at_s = 0.1, note = "go", tags = ["reset"] }]\n'
+        '[[expect]]\nevent = "note"\nwhere = { tags = "reset" }\n',
+        6,
+        "expect.where must be given with from, as the step at 0.1 s is such a note too",
+    ),
+    "limit with the name of an axis": (
+        HEAD + 'limits = { a = "2 mm" }\n[matrix.device]\na = ["9 mm"]\n' + PEAK.replace("2 mm", "{a}"),
+        5,
+        "matrix.device.a must be another name than those of placeholders",
+    ),
     "no such quantity": (HEAD + '[[expect]]\nscore = "gian"\nfile = "x.csv"\n', 4, "such as gain"),
 }
 
@@ -559,6 +603,7 @@ must = "<= 400 ms"
 
 [[expect]]
 event = "note"
+where = { from = "protection" }
 when = { vote = "1oo2", fault = ["disk_x-stuck", "sound"], danger = "300um" }
 """
 
@@ -590,7 +635,7 @@ def test_line_numbers_inside_tables_lists_and_inline_tables() -> None:
     "expect",
     [
         'event = "hammer"\n',
-        'event = "note"\n',
+        'order = [{ event = "note" }, { event = "hammer" }]\n',
         'event = "note"\nwhere = { from = "campaign" }\n',
         'event = "command"\nwhere = { from = "in" }\n',
         'event = "speed"\n',

@@ -92,6 +92,8 @@ def test_values_of_signals_are_those_of_their_rows(seen: CaseRecording) -> None:
     never = one(seen, signal="disk_x", take="first beyond", beyond="9 mm", must="<= 1 s")
     assert (math.isnan(never.value), never.good, never.note) == (True, False, "it never exceeds 9 mm")
     assert "nothing" in never.line
+    ended = one(seen, signal="disk_x", take="value", at_s=0.7, must="<= 9 mm")
+    assert (math.isnan(ended.value), ended.note) == (True, "no row at this time")
 
 
 def test_expected_events_are_checked_for_time_and_order(seen: CaseRecording) -> None:
@@ -300,10 +302,14 @@ def test_a_measurement_takes_units_and_refuses_wrong_ones() -> None:
         (("gap", 0.15, "mm", "between", (0.1, 0.2, 0.3), None), "two numbers, the lower first"),
         (("gap", 0.15, "mm", "<=", 2.0, "1"), "must be with a unit, as gap is in mm"),
         (("turns", 0.15, "1", "<=", 2.0, "mm"), "must be without a unit, as turns has none"),
+        (("gap", 0.15, "mm", "<=", math.inf, None), "limit must be with finite numbers only"),
+        (("gap", 0.15, "mm", "between", (0.0, math.inf), None), "limit must be with finite numbers only"),
+        (("gap", 0.15, "mm", "<=", 1.5e308, "m"), "unit_of_limit must be with finite numbers only"),
     ):
         with pytest.raises(InputError, match=re.escape(says)):
             judge_value(*given[:5], unit_of_limit=given[5])
-    assert not judge_value("gap", math.nan, "mm", "<=", 1.0).good
+    for value in (math.nan, math.inf):
+        assert not judge_value("gap", value, "mm", ">=", 1.0).good
 
 
 def results(**margins: float) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from replays.campaigns.equipment.bench import BenchSettings, Pace, Waits
 from replays.campaigns.equipment.device import CAN_PLACES, PLACEHOLDER, PLACES, check_program, fill_placeholders
 from replays.campaigns.files.case_results import Time, Units
 from replays.campaigns.files.event_fields import check_event
-from replays.campaigns.files.expectation import KINDS, Expect, find_selectors
+from replays.campaigns.files.expectation import KINDS, Expect, ExpectEvent, find_selectors
 from replays.campaigns.files.line_numbers import find_line, number_lines
 from replays.campaigns.measurement import split_quantity
 from rig.base.checks import Written, check, parse_toml
@@ -274,8 +274,14 @@ def _check_use(file: _File) -> None:
     used = {match[1] for match in PLACEHOLDER.finditer(json.dumps(places, default=str))}
     used |= {axis for each in file.expect if isinstance(when := each.get("when"), dict) for axis in when}
     matrix = file.matrix
-    for table, names in {"limits": file.limits, "matrix.limits": matrix.limits, "matrix.device": matrix.device}.items():
+    others = {"matrix.device": {**file.limits, **matrix.limits}, "matrix.set": {**matrix.limits, **matrix.device}}
+    for table, names in {"limits": file.limits, "matrix.limits": matrix.limits, "matrix.device": matrix.device,
+                         "matrix.set": matrix.set}.items():  # fmt: skip
         for name in names:
+            if name in (*PLACES, "scene", "fault", *others.get(table, ())):
+                raise InputError(f"{table}.{name}", "another name than those of placeholders, limits and axes", name)
+            if table == "matrix.set":
+                continue
             if name not in used:
                 raise InputError(f"{table}.{name}", f"used somewhere as {{{name}}}", Words("a name that nothing uses"))
 
@@ -359,6 +365,8 @@ def _case(
         expect = _expect(one, f"expect.{n}", places, units_by_table, duration_s)
         for at, selector in find_selectors(expect):
             check_event(selector, channels, field=f"expect.{n}{at}")
+        if isinstance(expect, ExpectEvent):
+            _check_reach(expect, f"expect.{n}", steps, file)
         _check_when(expect, f"expect.{n}.when", axes)
         _check_pace(expect, f"expect.{n}", devices if file.pace == "lockstep" else (), sources)
         if all(axis_labels[axis] in labels for axis, labels in _when(expect)):
@@ -514,6 +522,28 @@ def _check_when(expect: Expect, field: str, axes: Mapping[str, list[str]]) -> No
         for label in labels:
             if label not in axes[axis]:
                 raise UnknownNameError(f"{field}.{axis}", f"a value of {axis} in the matrix", label, axes[axis])
+
+
+def _check_reach(expect: ExpectEvent, field: str, steps: Sequence[Step], file: _File) -> None:
+    """Check that a device can decide an expected event: no step of the campaign is the event, and a block ends in time.
+
+    Raises:
+        InputError: If a step of the campaign is the event, or events of devices have no possible time between the two.
+    """
+    for step in steps if expect.appears and "from" not in expect.where else ():
+        sent = {"event": "note", "text": step.note, "tags": list(step.tags)}
+        if step.command is not None:
+            request = step.command.request
+            sent = {"event": "command", "command": request.command, "request": request.request()}
+        if (step.command is None or file.pace != "lockstep") and expect.of.matches(sent, {}):
+            must = f"given with from, as the step at {step.at_s:g} s is such a {expect.event} too"
+            raise InputError(f"{field}.where", must, str(expect.of))
+    if file.pace != "lockstep" or expect.to_s is None or expect.event not in ("note", "command", "device"):
+        return
+    block_s = 1e-3 * file.block_ms
+    if math.ceil(expect.from_s / block_s - 1e-6) * block_s >= expect.to_s - 1e-9:
+        must = f"after a multiple of block_ms since from_s, as {expect.event} has such times in lockstep"
+        raise InputError(f"{field}.to_s", must, expect.to_s)
 
 
 def _check_pace(expect: Expect, field: str, devices: tuple[_Device, ...], sources: set[str]) -> None:

@@ -114,6 +114,8 @@ def check_event(selector: EventOf, channels: Iterable[str], *, field: str) -> No
     fields = find_fields(selector.event, selector.where)
     if selector.text and "text" not in fields:
         raise InputError(f"{field}.text", f"left out, as {selector.event} has no text", selector.text)
+    if selector.text.strip() and (error := _find_error(fields["text"][0], selector.text.strip(), f"{field}.text")):
+        raise error
     for name, value in selector.where.items():
         place, table = f"{field}.where.{name}", name.rpartition(".")[0]
         if name not in fields and dict[str, int] not in fields.get(table, ()):

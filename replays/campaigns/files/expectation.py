@@ -22,6 +22,8 @@ Take = Literal[
     "whirl frequency",
 ]  # fmt: skip
 _TIMES = ("first beyond", "last beyond", "time beyond")
+_NOT_NEGATIVE = ("peak", "rms", "std", "peak to peak", "time beyond")
+"""Values that are never negative; nor is the radius of an orbit."""
 if TYPE_CHECKING:
     EventName = str
 else:
@@ -69,6 +71,18 @@ class _SignalFields(Written):
             received = Words(" and ".join(f"{name} in {signal_units[name]}" for name in self.names))
             raise InputError(f"{where}.signal", "two of one unit", received)
         return signal_units[self.names[0]]
+
+    def level(self, unit: str, *, where: str = "") -> float:
+        """Return the level `beyond` in the unit of the signal.
+
+        Raises:
+            InputError: If it is negative, or its unit is missing or wrong.
+        """
+        beyond: str = getattr(self, "beyond", "")
+        level = quantity(beyond, unit, field=f"{where}.beyond", of=_name(self.names))
+        if level < 0.0:
+            raise InputError(f"{where}.beyond", "at least 0, as an absolute value is compared with it", beyond)
+        return level
 
     def values(self, recording: CaseRecording) -> tuple[np.ndarray, np.ndarray]:
         """Return times from the start of the case [s] and values, for an orbit its radius, each of shape (n,)."""
@@ -137,8 +151,7 @@ class Since(_SignalFields):
             if getattr(self, name) and owner not in origins:
                 raise InputError(f"{where}.{name}", f"left out without {owner}", getattr(self, name))
         if self.signal:
-            unit = self.unit(units, where=where)
-            quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))
+            self.level(self.unit(units, where=where), where=where)
 
     @property
     def of(self) -> EventOf:
@@ -152,7 +165,7 @@ class Since(_SignalFields):
         if self.event:
             return next((each for each in self.of.times_s(recording) if each >= from_s), math.nan)
         times_s, values = self.values(recording)
-        level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="")
+        level = self.level(self.unit(units, where=""))
         rows = np.flatnonzero((np.abs(values) > level) & (times_s >= from_s - 1e-9))
         return float(times_s[rows[0]]) if len(rows) else math.nan
 
@@ -182,11 +195,14 @@ class ExpectSignal(_SignalFields, _Within):
             must = "given for" if self.take in _TIMES else "left out, except for the times"
             raise InputError(f"{where}.beyond", f"{must} {', '.join(_TIMES)}", self.beyond or None)
         if self.beyond:
-            quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))
+            self.level(unit, where=where)
             unit = "s"
         if (self.take == "value") != (self.at_s is not None):
             must = "given where take is value" if self.at_s is None else "left out, unless take is value"
             raise InputError(f"{where}.at_s", must, self.at_s)
+        for name in ("from_s", "to_s") if self.at_s is not None else ():
+            if getattr(self, name):
+                raise InputError(f"{where}.{name}", "left out with at_s", getattr(self, name))
         if self.take == "whirl frequency":
             if len(self.names) != 2:
                 raise InputError(f"{where}.signal", "the two of an orbit for a whirl frequency", list(self.names))
@@ -195,7 +211,10 @@ class ExpectSignal(_SignalFields, _Within):
             if self.take not in ("first beyond", "last beyond"):
                 raise InputError(f"{where}.since", "left out, unless take is first beyond or last beyond", self.take)
             self.since.check(units, where=f"{where}.since")
-        return parse_limit(self.must, unit, where=where, of=self.label)
+        must = parse_limit(self.must, unit, where=where, of=self.label)
+        if self.take in _NOT_NEGATIVE or (len(self.names) == 2 and self.take in ("max", "min", "mean", "value")):
+            must.check_decides(whole=False, field=f"{where}.must", of=self.label)
+        return must
 
     @property
     def label(self) -> str:
@@ -212,7 +231,7 @@ class ExpectSignal(_SignalFields, _Within):
         unit = "s" if self.beyond else "Hz" if self.take == "whirl frequency" else self.unit(units, where="expect")
         exact = f"1 row, {1e6 * row_s:g} us" if self.beyond else ""
         channels = () if self.truth else self.names
-        level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="") if self.beyond else None
+        level = self.level(self.unit(units, where="")) if self.beyond else None
         yield Measurement(
             self.label, convert_unit(value, unit, must), must, self.source, exact, note, at_s, channels, level=level
         )
@@ -221,6 +240,8 @@ class ExpectSignal(_SignalFields, _Within):
         times_s, values = self.values(recording)
         if self.at_s is not None:
             row = int(np.argmin(np.abs(times_s - self.at_s)))
+            if abs(times_s[row] - self.at_s) > 1.0 / recording.rows(self.truth, self.names).rate_hz:
+                return math.nan, None, "no row at this time"
             return float(values[row]), float(times_s[row]), ""
         kept = (times_s >= self.from_s - 1e-9) & (times_s < (math.inf if self.to_s is None else self.to_s) - 1e-9)
         times_s, part = times_s[kept], values[kept]
@@ -232,8 +253,7 @@ class ExpectSignal(_SignalFields, _Within):
             x, y = (recording.rows(self.truth, self.names)[name][kept] for name in self.names)
             return whirl_frequency(x, y, times_s), float(times_s[0]), ""
         if self.beyond:
-            level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="")
-            rows = np.flatnonzero(np.abs(part) > level)
+            rows = np.flatnonzero(np.abs(part) > self.level(self.unit(units, where="")))
             if self.take == "time beyond":
                 rate = recording.rows(self.truth, self.names).rate_hz
                 return len(rows) / rate, float(times_s[rows[0]]) if len(rows) else None, ""
@@ -287,7 +307,10 @@ class ExpectEvent(_Within):
             return Must("==" if not self.appears else ">=", 0.0 if not self.appears else 1.0, "1")
         if not self.appears:
             raise InputError(f"{where}.appears", "left out with must", False)
-        return parse_limit(self.must, "1" if self.take == "count" else "s", where=where, of=self.label)
+        must = parse_limit(self.must, "1" if self.take == "count" else "s", where=where, of=self.label)
+        if self.take == "count":
+            must.check_decides(whole=True, field=f"{where}.must", of=self.label)
+        return must
 
     @property
     def of(self) -> EventOf:
@@ -327,7 +350,7 @@ class ExpectEvent(_Within):
         channels = () if self.since is None or self.since.truth or not self.since.signal else self.since.names
         since, level = self.since, None
         if since is not None and channels:
-            level = quantity(since.beyond, since.unit(units, where=""), field="beyond", of="")
+            level = since.level(since.unit(units, where=""))
         yield Measurement(
             self.label, convert_unit(value, "s", must), must, self.source, exact, note,
             about if math.isfinite(about) else None, channels,
