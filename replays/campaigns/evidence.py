@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 import shutil
@@ -121,9 +122,12 @@ class Trial:
         """
         assert self.bench is not None
         bench, before = self.bench, self.bench.links
+        if not re.fullmatch(r"[\w.-]{1,50}", name) or name == "rig":
+            raise InputError("name", "1 to 50 letters, digits, dots, dashes and underscores, and not rig", name)
+        again = sum(each.name == name for each in self.devices)
+        log = self.records / (f"{name}-{again + 1}.log" if again else f"{name}.log")
         device = Device(
-            command, name=name, bench=bench, log=self.records / f"{name}.log", where=where, files=self.folder,
-            may_end=may_end,
+            command, name=name, bench=bench, log=log, where=where, files=self.folder, may_end=may_end,
         )  # fmt: skip
         self.devices.append(device)
         self.digests |= device.digests
@@ -197,7 +201,7 @@ class Trial:
     def _keep_evidence(self) -> None:
         if self.settings is None:
             return
-        folder = self.records if self.evidence is None else self.evidence / folder_name(self.id)
+        folder = self.records if self.evidence is None else self.evidence / case_folder(self.id)
         folder.mkdir(parents=True, exist_ok=True)
         # Logs and files of devices; an excerpt replaces the recorded session.
         for log in sorted(self.records.glob("*.log")):
@@ -275,6 +279,14 @@ class Trial:
                 raise error(unmet[0].line + (f"; and {len(unmet) - 1} more" if unmet[1:] else ""))
 
 
+def case_folder(name: str) -> str:
+    """Return the folder name of a test, different from those of other tests."""
+    folder = folder_name(name)
+    if folder == re.sub(r"::|[\[\]]", "_", name):
+        return folder
+    return f"{folder[-140:]}-{hashlib.sha256(name.encode(errors='replace')).hexdigest()[:8]}"
+
+
 def folder_name(name: str) -> str:
-    """Return a folder name for a test."""
+    """Return a text as the name of a file or folder."""
     return re.sub(r"[^\w.=,+-]+", "_", name)[-150:]

@@ -149,7 +149,9 @@ def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:
     if wanted <= spare:
         return tuple(natural)
     if spare <= 0.0:  # too narrow for whole words
-        return tuple(width * pdf.epw / sum(least) for width in least)
+        fair = [min(width, pdf.epw / len(least)) for width in least]
+        share = (pdf.epw - sum(fair)) / ((sum(least) - sum(fair)) or 1.0)
+        return tuple(a + (b - a) * share for a, b in zip(fair, least, strict=True))
     return tuple(a + (b - a) * spare / wanted for a, b in zip(least, natural, strict=True))
 
 

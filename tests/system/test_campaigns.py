@@ -376,7 +376,10 @@ def test_skip():
 """
 
 
-def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(tmp_path: Path) -> None:
+def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTEST_ADDOPTS", "--collect-only")  # options of somebody else's tests
     (tmp_path / "test_open.py").write_text(OPEN, encoding="utf-8")
     out, document = run_campaign(
         tmp_path, "test_open.py", "-k", "test_pass or test_skip or (test_open and not fail)", status=3
@@ -389,6 +392,7 @@ def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(tm
     run_campaign(tmp_path, "test_open.py", "-k", "test_pass", status=0)
     _, document = run_campaign(tmp_path, "test_open.py", status=1)
     assert document["cases"][2]["reason"].startswith("gap must be <= 1 mm; received 2 mm")
+    monkeypatch.delenv("PYTEST_ADDOPTS")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml=plain.xml", "test_open.py"]
     found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert "1 failed, 1 passed, 1 skipped, 1 error" in found.stdout, found.stdout + found.stderr

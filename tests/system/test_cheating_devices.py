@@ -116,6 +116,8 @@ def leaves_and_stays(machine): machine.leave(); time.sleep(600)
 def is_slow(machine): time.sleep(3.0)
 def wrong_block(machine): machine.done(123)
 def stops_the_rig(machine): machine.stop()
+def steps_the_rig(machine): machine.step(10_000)
+def clears_faults(machine): machine.clear()
 def kills_the_rig(machine): [each.kill() for each in rigs()]
 def kills_supervisor(machine): start_child(STUBBORN); os.kill(os.getppid(), signal.SIGKILL); time.sleep(600)
 def stops_supervisor(machine): os.kill(os.getppid(), signal.SIGSTOP); time.sleep(600)
@@ -239,7 +241,9 @@ REPLACED = "the recording was replaced or altered during the test: "
 ALTERED = r"changed program files of protection .*changed during the run: device\.py; output belongs in {folder}"
 NO_LINK = "without symbolic links"
 ENDED = "early ends of protection must be == 0; received 1 "
+STOPPED = r"commands stop of devices must be == 0; received 1 \(by protection"
 QUICK = {
+    "clears_faults": r"commands clear of devices must be == 0; received 1 \(by protection",
     "swaps_part": REPLACED + "another file",
     "alters_program": ALTERED,
     "alters_index": REPLACED + "it was truncated or appended to, or its records cannot be read",
@@ -278,6 +282,7 @@ REASONS = {
     "is_slow": LOST,
     "wrong_block": "times that protection was lost must be == 0; received 1 |exit status",
     "stops_the_rig": "end of the run must be >= 0.3 s",
+    "steps_the_rig": "commands step of devices ",
     "kills_the_rig": "the rig exited with status 137",
     "restarts_the_rig": "the rig exited with status 137",
     "stops_the_rigs_process": "the rig did not complete a step within patience_s = 20 s",
@@ -292,7 +297,7 @@ REASONS = {
     "alters_session": REPLACED,
     "ignores_sigterm": r"exit status of protection must be == 0; received 137 \(it had to be killed: it did not end",
 }  # fmt: skip
-PYTHON = {"leaves": ENDED}
+PYTHON = {"leaves": ENDED, "stops_the_rig": STOPPED}
 if CHOSEN:
     PYTHON |= {how: REASONS[how] for how in ("sound", "killed", "hangs", "raises", "exits_3", "vanishes", "swaps_part")}
     PYTHON |= {"leaves_allowed": "", "killed_by_test": ""}

@@ -170,7 +170,11 @@ def test_a_program_or_script_that_is_missing_is_refused(tmp_path: Path) -> None:
     (tmp_path / "tool").touch()
     for words in (["python"], ["python", "here.py"], ["tool", "-x"], ["python", "-m", "nowhere.py"]):
         check_program(words, tmp_path, field="command")
-    for words, must in ((["python", "no.py"], "whose script is there"), (["tol"], "that there is"), ([], "a command")):
+    for words, must in (
+        (["python", "no.py"], "with a script that exists in"),
+        (["tol"], "a program in PATH"),
+        ([], "a command"),
+    ):
         with pytest.raises(InputError, match=must):
             check_program(words, tmp_path, field="command")
 
@@ -280,7 +284,7 @@ def test_files_of_devices_are_kept_up_to_their_limits(tmp_path: Path, monkeypatc
         for folder in (files / "a", records):
             folder.mkdir(parents=True)
         settings = BenchSettings()
-        trial = Trial("x.py::case a", out, folder=files, records=records, settings=settings, keeps_all=keeps)
+        trial = Trial("x.py::case-a", out, folder=files, records=records, settings=settings, keeps_all=keeps)
         for name, text in (("a_x", "12"), ("a/x", "34567"), ("a/y", ""), ("b", "3456789"), ("c", "")):
             (files / name).write_text(text)
         (files / "link").symlink_to("/etc/passwd")
@@ -288,13 +292,13 @@ def test_files_of_devices_are_kept_up_to_their_limits(tmp_path: Path, monkeypatc
         stopped = list[int]()
         trial.record = cast("Any", SimpleNamespace(stop=lambda stopped=stopped: stopped.append(1), sha256="0a"))
         trial.close(failed=failed)
-        assert (stopped, trial.digests) == ([1], {"recording of x.py::case a": "0a"})
+        assert (stopped, trial.digests) == ([1], {"recording of x.py::case-a": "0a"})
         assert not files.exists()
         assert not records.exists()
         if not (keeps or failed):
             assert not out.exists()
             continue
-        kept = [str(each.relative_to(out / "x.py_case_a")) for each in trial.kept]
+        kept = [str(each.relative_to(out / "x.py_case-a")) for each in trial.kept]
         assert kept == ["rig.log", "files/a_x", "files/c", "files/4-a_x"]
         assert trial.troubles[0].endswith("no plain file): 3: b, link, a_y")
         shutil.rmtree(out)

@@ -11,6 +11,7 @@ from replays.campaigns.equipment.device import CAN_PLACES, fill_placeholders
 from replays.campaigns.files.campaign import Campaign, campaign_path, find_shipped, load_campaign, read_title
 from replays.campaigns.files.expectation import ExpectEvent
 from replays.campaigns.files.line_numbers import number_lines
+from replays.campaigns.files.scored import ExpectScore
 from rig.base.errors import InputError
 from tests.commands import run_captured
 
@@ -535,6 +536,15 @@ def test_shipped_campaigns_are_listed_by_name_and_load(capsys: pytest.CaptureFix
         assert read_title(path)[:30] in " ".join(out.split())
     with pytest.raises(InputError, match="a file or a shipped campaign, such as hammer"):
         campaign_path("hamer")
+
+
+def test_shipped_campaigns_judge_what_the_device_leaves() -> None:
+    for case in load_campaign(campaign_path("fault-endurance")).cases:
+        assert any(isinstance(each, ExpectScore) and each.file == "daq.mcap" for each in case.expects), case.id
+    for case in load_campaign(campaign_path("protection-trip")).cases:
+        impact_s = case.steps[0].at_s
+        early = [each for each in case.expects if isinstance(each, ExpectEvent) and each.to_s == impact_s]
+        assert [each.appears for each in early] == [False], "a monitor that always trips would pass"
 
 
 def test_the_cases_are_listed_with_their_number(

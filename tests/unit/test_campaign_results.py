@@ -19,12 +19,19 @@ import pytest
 
 from recorder.reader import Recording
 from replays.campaigns import plugin
-from replays.campaigns.equipment.bench import Bench, BenchError, BenchSettings, Target, validate_replay
-from replays.campaigns.evidence import Trial
-from replays.campaigns.files.campaign import find_shipped, load_campaign
+from replays.campaigns.equipment.bench import (
+    Bench,
+    BenchError,
+    BenchSettings,
+    Target,
+    UnsupportedError,
+    validate_replay,
+)
+from replays.campaigns.evidence import Trial, case_folder
+from replays.campaigns.files.campaign import Step, find_shipped, load_campaign
 from replays.campaigns.files.case_results import CaseRecording
 from replays.campaigns.files.expectation import KINDS, ExpectEvent
-from replays.campaigns.files.run import end_device, measure_end, run_repeatedly
+from replays.campaigns.files.run import end_device, measure_end, measure_interference, run_repeatedly, send_step
 from replays.campaigns.measurement import Measurement, Must, judge_value
 from replays.campaigns.reporting.file_names import name_files
 from replays.campaigns.reporting.page import changes, make_page
@@ -34,10 +41,12 @@ from replays.campaigns.reporting.sheet import check_sheet, make_sheet, parse_ide
 from replays.report import junit, write_report
 from replays.report.document import Picture, Table
 from rig.base.checks import check
-from rig.base.errors import InputError
+from rig.base.errors import InputError, RefusedError
 from rig.base.outcome import Outcome
 from rig.channels.orbit import whirl_frequency
 from rig.channels.table import default_table
+from rig.run.commands.channel import ClearCommand
+from rig.run.commands.table import TimedCommand
 from tests.processes import ROOT
 from tests.score_daqs import make_counts, write_parquet, write_session
 
@@ -254,6 +263,52 @@ def test_a_run_stopped_early_fails_unless_expected(tmp_path: Path) -> None:
     assert told({**end, "reason": "completed"}) == told({**end, "time_s": 0.5}) == told() == []
 
 
+def test_commands_of_the_test_fail_a_device_that_sends_them(tmp_path: Path) -> None:
+    counts = make_counts("probes", np.zeros((200, 4)), None)
+    session = CaseRecording(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
+    commands = [(name, sender) for name in ("speed", "stop", "clear", "step") for sender in ("guard", "test-1")]
+    session.events = [(0.0, {"event": "command", "command": name, "from": sender}) for name, sender in commands]
+    expected = check(KINDS["event"], {"event": "command", "where": {"command": "clear"}}, field="")
+    for expects, may_end, wrong in (
+        ((), False, ["clear", "step"]), ((expected,), False, ["step"]), (None, False, ["stop", "clear", "step"]),
+        (None, True, ["clear", "step"]),
+    ):  # fmt: skip
+        trial = Trial("a", folder=tmp_path, devices=[cast("Any", SimpleNamespace(may_end=may_end))])
+        trial.bench = cast(
+            "Any",
+            SimpleNamespace(
+                client_names={"campaign", "test-1"},
+                can_url=None,
+                url="",
+                socketcand_url="",
+                slcan_path="",
+                name="",
+            ),
+        )
+        measure_interference(session, trial, expects)
+        assert [each.name for each in trial.measurements] == [f"commands {name} of devices" for name in wrong]
+        assert {each.note for each in trial.measurements} == {"by guard; it is up to the test"}
+
+
+def test_a_step_that_the_rig_refuses_is_no_reason_to_skip_unless_it_is_somebody_elses_rig() -> None:
+    def send(*_: object, **__: object) -> None:
+        raise RefusedError("clear.id must be the number of an active fault (none), or all; received 1")
+
+    step = Step(0.5, TimedCommand(at_s=0.5, request=ClearCommand(id=1)))
+    for owns_rig, kind in ((True, BenchError), (False, UnsupportedError)):
+        with pytest.raises(kind, match=r"the rig refuses a step at 0\.5 s: clear\.id must be"):
+            send_step(cast("Any", SimpleNamespace(send=send)), step, owns_rig=owns_rig)
+
+
+def test_cases_have_different_folders_for_their_evidence() -> None:
+    long = "a" * 200
+    names = [f"x.campaign.toml::{each}" for each in ("a", f"b{long}", f"c{long}", "a b", "a_b", "a\nb")]
+    folders = [case_folder(name) for name in names]
+    assert len({*folders}) == len(names)
+    assert folders[0] == "x.campaign.toml_a"
+    assert all(re.fullmatch(r"[\w.=-]{1,150}", each) for each in folders)
+
+
 def test_only_a_device_that_must_be_killed_fails(tmp_path: Path) -> None:
     for status, notes in (
         (137, ["it had to be killed: it did not end within end_s = 5 s of a SIGTERM"]),
@@ -420,6 +475,13 @@ def test_the_page_lists_failures_first_then_changes(tmp_path: Path) -> None:
         now["cases"][1]["evidence"] = [f"evidence/{number}" for number in range(1, count + 1)]
         texts = [str(part) for part in make_page(now, tmp_path).parts]
         assert any(each.rstrip("')").endswith(text) for each in texts), texts
+
+
+def test_a_sheet_in_pdf_has_room_for_words_without_spaces(tmp_path: Path) -> None:
+    found = results(good=0.4)
+    found["cases"][0]["measurements"][0] |= {"name": "a" * 300, "source": "b" * 80}
+    write_report(make_sheet(found, tmp_path, {"c" * 200: "d" * 200}), tmp_path / "s.pdf")
+    assert (tmp_path / "s.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_the_sheet_has_identity_verdicts_digests_and_room_to_sign(tmp_path: Path) -> None:

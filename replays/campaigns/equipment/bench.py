@@ -153,6 +153,8 @@ class Bench(Closing):
         self.name = f"bench-{os.getpid()}-{next(_NUMBERS)}"
         self._program: Program | None = None
         self._clients: list[Rig] = []
+        self.client_names: set[str] = set()
+        """Names of the clients of the test."""
         self.late = self._late_before = 0
         """Late blocks of a rig in real time during the test, as counted last."""
         self._is_counting = False
@@ -231,12 +233,14 @@ class Bench(Closing):
         """Return a client of the rig, as `rig.connect` does; it is closed with the bench.
 
         Args:
-            name: Name of the client.
+            name: Name of the client; None: a new one.
             wait_s: Longest wait for the rig [s].
             settings: `channels` (default: those of the bench), `rate_hz`, `truth`, ...
         """
         from drivers.client import connect
 
+        name = name or f"test-{len(self._clients)}"
+        self.client_names.add(name)
         client = connect(self.url, wait_s=wait_s, name=name, **{"channels": self.settings.channels, **settings})
         self._clients.append(client)
         return client

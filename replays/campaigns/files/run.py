@@ -23,9 +23,12 @@ if TYPE_CHECKING:
     from replays.campaigns.equipment.device import Device
     from replays.campaigns.evidence import Trial
     from replays.campaigns.files.campaign import Case, Step
+    from replays.campaigns.files.expectation import Expect
 
 REPETITION_NAME = "runs alike"
 """Name of the measurement that counts the runs that are like the first one."""
+_EQUIPMENT = ("step", "fault", "clear")
+"""Commands of the test alone: a device that sends them changes what it is tested with."""
 _MAX_DIFFERENCES = 4
 """Number of differences between runs that are listed."""
 
@@ -64,13 +67,13 @@ def run_case(case: Case, trial: Trial) -> None:
     with bench.connect(name="campaign", channels=()) as machine:
         for step in live:
             bench.advance_to(trial.origin_s + step.at_s)
-            _send(machine, step)
+            send_step(machine, step, owns_rig=trial.target.owns_rig)
         end_s = trial.origin_s + case.duration_s
         # A device that needs the last block has not ended before it.
         bench.advance_to(end_s - 1e-3 * settings.block_ms)
         note_early_ends(trial)
         bench.advance_to(end_s)
-        results = finish_run(trial)
+        results = finish_run(trial, case.expects)
     measure_end(results, trial, case)
     for expect in case.expects:
         for measurement in expect.measure(results, results.units):
@@ -86,7 +89,13 @@ def _step(command: TimedCommand) -> Step:
     return Step(command.at_s, command)
 
 
-def _send(machine: Rig, step: Step) -> None:
+def send_step(machine: Rig, step: Step, *, owns_rig: bool) -> None:
+    """Send the command or note of a step.
+
+    Raises:
+        BenchError: If the test's own rig refuses it.
+        UnsupportedError: If another rig refuses it.
+    """
     try:
         if step.command is None:
             machine.note(step.note, tags=list(step.tags))
@@ -96,11 +105,16 @@ def _send(machine: Rig, step: Step) -> None:
     except RefusedError as error:
         if wire.ENDED in str(error):
             return  # `measure_end` judges the end of the run
-        raise UnsupportedError(f"the rig refuses a step at {step.at_s:g} s: {error}") from None
+        kind = BenchError if owns_rig else UnsupportedError  # a device may have changed the state of the test's own rig
+        raise kind(f"the rig refuses a step at {step.at_s:g} s: {error}") from None
 
 
-def finish_run(trial: Trial) -> CaseRecording:
+def finish_run(trial: Trial, expects: Sequence[Expect] | None = None) -> CaseRecording:
     """End the run, the devices and the recording, and judge the devices, for campaign files and tests in Python alike.
+
+    Args:
+        trial: The running test.
+        expects: Expectations of a campaign file; None for a test in Python.
 
     Raises:
         BenchError: If the rig or the recording failed.
@@ -119,6 +133,7 @@ def finish_run(trial: Trial) -> CaseRecording:
     results = CaseRecording(trial.recording, trial.folder, trial.origin_s, names)
     for device in trial.devices:
         _measure_device(device, results, trial, lost)
+    measure_interference(results, trial, expects)
     if trial.devices and not trial.has_folder():
         trial.take(Measurement("times that {folder} was removed or replaced", 1.0, Must("==", 0.0, "1")))
     if (files := sum(1 for _ in trial.find_files())) > MAX_FILES:
@@ -160,6 +175,23 @@ def measure_end(results: CaseRecording, trial: Trial, case: Case) -> None:
         by = next((event["from"] for _, event in results.events if event.get("command") == "stop"), "")
         note = f"{event.get('reason')}{f' by {by}' if by else ''}, before the case was over"
         trial.take(Measurement("end of the run", at_s, Must(">=", case.duration_s, "s"), note=note, at_s=at_s))
+
+
+def measure_interference(results: CaseRecording, trial: Trial, expects: Sequence[Expect] | None) -> None:
+    """Add a failed measurement if a device changed the test: its faults or its steps.
+
+    In a test in Python also if it stopped the run; `measure_end` judges that for a campaign file.
+    """
+    assert trial.bench is not None
+    commands = {*_EQUIPMENT, *(() if expects is not None or any(each.may_end for each in trial.devices) else ("stop",))}
+    for event in expected_events(expects or ()):
+        commands -= {event.event, event.where.get("command")}
+    for at_s, event in results.events if trial.devices and trial.target.owns_rig else ():
+        command, sender = event.get("command"), event.get("from")
+        if event["event"] == "command" and command in commands and sender not in trial.bench.client_names:
+            name, note = f"commands {command} of devices", f"by {sender}; it is up to the test"
+            trial.take(Measurement(name, 1.0, Must("==", 0.0, "1"), note=note, at_s=at_s))
+            commands.discard(command)
 
 
 def _measure_device(device: Device, results: CaseRecording, trial: Trial, lost: Mapping[str, str]) -> None:

@@ -114,8 +114,8 @@ def make_sheet(
         ])  # fmt: skip
         add_picture(report, case, folder, f"Signals and events: {case['id']}.")
     report.heading("Digests (SHA-256)")
-    digests = {file: digest for case in wall["cases"].values() for file, digest in case.get("digests", {}).items()}
-    report.table(("file", "digest"), list(digests.items()))
+    digests = [each for case in wall["cases"].values() for each in case.get("digests", {}).items()]
+    report.table(("file", "digest"), list(dict.fromkeys(digests)))
     report.heading("Signatures")
     report.table(
         ("", "name", "date", "signature"), [(who, _LINE, _LINE, _LINE) for who in ("tested by", "approved by")]

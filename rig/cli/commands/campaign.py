@@ -222,6 +222,8 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     places = [Path(file.partition("::")[0]).absolute() for file in files]
     root = os.path.commonpath([place if place.is_dir() else place.parent for place in places])
     plugins += ["-c", os.devnull, "--rootdir", root]
+    for name in ("PYTEST_ADDOPTS", "PYTEST_PLUGINS", "PYTEST_DISABLE_PLUGIN_AUTOLOAD"):
+        os.environ.pop(name, None)  # nor must the environment
     with bypass_capture(progress_bar(transient=True)) as bar:
         progress = ProgressPlugin(bar)
         status = pytest.main([*plugins, *options, *files], plugins=[progress])
