@@ -31,9 +31,10 @@ from drivers.sources import Source
 from drivers.sources.rig import RigSource
 from drivers.sources.samples import ALL_AVAILABLE, RIG_LOST, RowReader, Samples, StreamEndedError, follow, merge_samples
 from drivers.sources.stream import RigStream
-from drivers.sources.turns import PULSE_LEVEL, Turn, find_pulses, measure_turn
+from drivers.sources.turns import Turn, find_pulses, measure_turn
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
+from rig.channels.orbit import PULSE_LEVEL
 from rig.serve.stream_check import BlockEnd, Catalogue, parse_block_end
 from rig.serve.transport import DEFAULT_ENDPOINT, Client, RigLostError
 from rig.serve.waiting import Deadline

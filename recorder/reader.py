@@ -20,12 +20,12 @@ from recorder.contents.samples import build_samples, row_times_s
 from recorder.files import schemas
 from recorder.files.chunks import Chunk
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.samples import Samples, merge_samples
+from rig.base.samples import Plottable, Samples, merge_samples
 from rig.base.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, get_schema, sensor_key, truth_key
 from rig.channels.faults.ledger import Declared, sort_blocks
 
 
-class Recording:
+class Recording(Plottable):
     """Recording, read from the disk topic by topic. Only documents are kept in memory, and no file stays open.
 
     Attributes:

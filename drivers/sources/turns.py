@@ -9,10 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.sources.samples import Samples
-from rig.channels.orbit import synchronous
-
-PULSE_LEVEL = 0.5
-"""Keyphasor signal, 0 to 1, at whose rise a pulse begins."""
+from rig.channels.orbit import find_edges, synchronous
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +41,7 @@ class Turn:
 
 def find_pulses(samples: Samples) -> np.ndarray:
     """Return the times at which keyphasor pulses begin [s], interpolated between samples, shape (pulses,)."""
-    signal, times_s = samples["keyphasor"], samples.times_s
-    rows = np.flatnonzero((signal[:-1] < PULSE_LEVEL) & (signal[1:] >= PULSE_LEVEL))
-    fraction = (PULSE_LEVEL - signal[rows]) / (signal[rows + 1] - signal[rows])
-    return times_s[rows] + fraction / samples.rate_hz
+    return find_edges(samples["keyphasor"], samples.times_s)
 
 
 def measure_turn(samples: Samples, begin_s: float, end_s: float) -> Turn:

@@ -28,7 +28,23 @@ def find_column(name: str, names: Sequence[str], *, must: str = "one of the exis
     return names.index(name)
 
 
-class Columns:
+class Plottable:
+    """Data with the pictures of `replays.plots` as methods: `run.plot.orbit(last_s=0.3)`."""
+
+    __slots__ = ()
+
+    @property
+    def plot(self) -> Any:
+        """Pictures of these data, each a method that returns matplotlib axes and a table; `dir(run.plot)` lists them.
+
+        They are `replays.plots.methods.Plots`, which must not be imported from here.
+        """
+        from importlib import import_module
+
+        return import_module("replays.plots.methods").Plots(self)
+
+
+class Columns(Plottable):
     """Rows of named columns: `rows["disk_x"]`, `rows.unit("disk_x")`, and `rows.to_si()` for all columns in SI.
 
     Attributes:

@@ -8,6 +8,7 @@ first, then their timing: `rate_hz`, `times_s`, `edges_s`, in this order.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,8 @@ from rig.base.errors import InputError, Words
 
 SPECTRUM_HZ = 200.0
 """Frequency limit of displayed spectra, both sides [Hz]; the rig whirls below 130 Hz."""
+PULSE_LEVEL = 0.5
+"""Keyphasor signal, 0 to 1, at whose rise a pulse begins."""
 _LAG_S = 1e-3
 _MIN_TURN_SAMPLES = 8
 _MAX_TURN_GAP = 0.25
@@ -120,9 +123,16 @@ def full_spectrum(
 
 
 def waterfall(
-    x: ArrayLike, y: ArrayLike, rate_hz: float, times_s: ArrayLike, *, window_s: float = 0.5, hop_s: float = 0.1
+    x: ArrayLike,
+    y: ArrayLike,
+    rate_hz: float,
+    times_s: ArrayLike,
+    *,
+    window_s: float = 0.5,
+    hop_s: float = 0.1,
+    limit_hz: float = SPECTRUM_HZ,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return full spectra over time, up to `SPECTRUM_HZ`.
+    """Return full spectra over time.
 
     Args:
         x: Horizontal, shape (n,).
@@ -131,6 +141,7 @@ def waterfall(
         times_s: Times [s], ascending, shape (n,).
         window_s: Length of a window [s].
         hop_s: Time between two windows [s].
+        limit_hz: Largest frequency, both sides [Hz].
 
     Returns:
         Times of the windows' centres [s], shape (t,); frequencies [Hz], shape (f,); amplitudes in the unit of x, shape
@@ -147,17 +158,19 @@ def waterfall(
         ['0.25 s: 4 Hz', '0.95 s: 18 Hz', '1.65 s: 32 Hz']
     """
     x, y, times_s = _check_rows(x=x, y=y, times_s=times_s)
-    _check_positive(rate_hz=rate_hz, window_s=window_s, hop_s=hop_s)
+    _check_positive(rate_hz=rate_hz, window_s=window_s, hop_s=hop_s, limit_hz=limit_hz)
     size, hop = (max(1, round(each * rate_hz)) for each in (window_s, hop_s))
     starts = range(0, max(1, len(x) - size + 1), hop)
     spectra = [full_spectrum(x[s : s + size], y[s : s + size], rate_hz) for s in starts]
     frequency = spectra[0][0]
-    in_range = np.abs(frequency) <= SPECTRUM_HZ
+    in_range = np.abs(frequency) <= limit_hz
     centres = np.array([times_s[min(s + size // 2, len(x) - 1)] for s in starts])
     return centres, frequency[in_range], np.array([amplitude[in_range] for _, amplitude in spectra])
 
 
-def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def synchronous(
+    values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike, *, order: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the 1X component of a signal for each revolution, as shown in a Bode plot of a run-up.
 
     Fitted to each revolution together with its mean, so that the number of samples need not be whole.
@@ -166,14 +179,15 @@ def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tu
         values: A signal, such as one probe, shape (n,).
         times_s: Times [s], ascending, shape (n,).
         edges_s: Keyphasor edges [s], ascending, shape (edges,).
+        order: Multiple of the speed: 2 for the 2X component.
 
     Returns:
         Speed of each revolution between two edges [Hz], and its complex 1X amplitude: magnitude (`np.abs`, in the unit
         of the values) and phase from the edge (`np.angle` [rad]; negative lags), each shape (turns,). Revolutions
-        with fewer than 8 samples, or with a gap of a quarter revolution, are omitted.
+        with fewer than 8 samples (or 4 per period of the order), or with a gap of a quarter revolution, are omitted.
 
     Raises:
-        InputError: The arguments are not rows of numbers, or values and times differ in length.
+        InputError: The arguments are not rows of numbers, values and times differ in length, or the order is invalid.
 
     Example:
         >>> times_s = np.arange(4000) / 2000.0
@@ -184,17 +198,64 @@ def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tu
     """
     values, times_s = _check_rows(values=values, times_s=times_s)
     (edges_s,) = _check_rows(edges_s=edges_s, at_least=0)
+    if not isinstance(order, int | np.integer) or order < 1:
+        raise InputError("order", "a whole number of at least 1", order)
+    turns, vectors = fit_turns(values[:, None], times_s, edges_s, (int(order),))
+    return 1.0 / np.diff(edges_s)[turns], vectors[:, 1, 0]
+
+
+def fit_turns(
+    values: np.ndarray,
+    times_s: np.ndarray,
+    edges_s: np.ndarray,
+    orders: tuple[int, ...] = (1,),
+    *,
+    revolutions: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and synchronous components of several signals for each revolution, fitted together.
+
+    Args:
+        values: Signals, shape (n, signals).
+        times_s: Times [s], ascending, shape (n,).
+        edges_s: Keyphasor edges [s], ascending, shape (edges,).
+        orders: Multiples of the speed.
+        revolutions: Angle of the shaft from the first edge [revolutions], shape (n,); None for uniform rotation within
+            each revolution.
+
+    Returns:
+        Number of each revolution, that of its first edge, shape (turns,); and its complex components as of
+        `synchronous`, shape (turns, 1 + orders, signals), the mean first. Revolutions are omitted as there.
+    """
     places = np.searchsorted(times_s, edges_s)
-    speeds, vectors = [], []
-    for first, last, begin_s, end_s in zip(places, places[1:], edges_s, edges_s[1:], strict=False):
-        turns = (times_s[first:last] - begin_s) / (end_s - begin_s)
-        if len(turns) >= _MIN_TURN_SAMPLES and np.diff(turns, append=turns[0] + 1.0).max() < _MAX_TURN_GAP:
-            angle = 2.0 * math.pi * turns
-            parts = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1)
-            (cosine, sine, _), *_ = np.linalg.lstsq(parts, values[first:last])
-            speeds.append(1.0 / (end_s - begin_s))
-            vectors.append(complex(cosine, -sine))
-    return np.array(speeds), np.array(vectors, dtype=complex)
+    least, found = max(_MIN_TURN_SAMPLES, 4 * max(orders)), list[int]()
+    vectors = []
+    for turn, (first, last) in enumerate(pairwise(places)):
+        if revolutions is None:
+            turns = (times_s[first:last] - edges_s[turn]) / (edges_s[turn + 1] - edges_s[turn])
+        else:
+            turns = revolutions[first:last] - turn
+        if len(turns) >= least and np.diff(turns, append=turns[0] + 1.0).max() < _MAX_TURN_GAP:
+            angles = 2.0 * math.pi * np.outer(turns, orders)
+            parts = np.concatenate([np.cos(angles), np.sin(angles), np.ones_like(angles[:, :1])], axis=1)
+            fitted, *_ = np.linalg.lstsq(parts, values[first:last])
+            count = len(orders)
+            found.append(turn)
+            vectors.append(np.concatenate([fitted[-1:], fitted[:count] - 1j * fitted[count:-1]]))
+    shape = (len(found), 1 + len(orders), values.shape[1])
+    return np.array(found, dtype=int), np.array(vectors, dtype=complex).reshape(shape)
+
+
+def find_edges(signal: np.ndarray, times_s: np.ndarray, level: float = PULSE_LEVEL) -> np.ndarray:
+    """Return the times at which pulses of a signal rise through a level [s], interpolated, shape (pulses,).
+
+    Args:
+        signal: Keyphasor signal, shape (n,).
+        times_s: Times [s], ascending, shape (n,).
+        level: Level, in the unit of the signal.
+    """
+    rows = np.flatnonzero((signal[:-1] < level) & (signal[1:] >= level))
+    fraction = (level - signal[rows]) / (signal[rows + 1] - signal[rows])
+    return times_s[rows] + fraction * (times_s[rows + 1] - times_s[rows])
 
 
 def _check_rows(*, at_least: int = 1, **arrays: ArrayLike) -> list[np.ndarray]:

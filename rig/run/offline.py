@@ -13,7 +13,7 @@ import numpy as np
 
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.files import whole_file
-from rig.base.samples import Samples, find_column, merge_samples
+from rig.base.samples import Plottable, Samples, find_column, merge_samples
 from rig.channels.formula import check_computed
 from rig.channels.table import ChannelTable
 from rig.physics.kernels.signals import COLUMN, N_ROW, ROW
@@ -36,7 +36,7 @@ class SentCommand(NamedTuple):
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Run:
+class Run(Plottable):
     """A finished run: `run["disk_x"]` is the model's signal in SI, `run.samples["disk_x"]` the reading of the probe.
 
     Attributes:

@@ -21,7 +21,7 @@ LONGEST_FUNCTION = 120
 SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
-    "drivers": 709,
+    "drivers": 710,
     "drivers/can": 4535,
     "drivers/examples": 86,
     "drivers/instruments": 845,
@@ -37,14 +37,15 @@ BUDGETS = {
     "replays/campaigns": 3314,
     "replays/estimate": 337,
     "replays/player": 816,
+    "replays/plots": 592,
     "replays/recordings": 10330,
     "replays/report": 491,
     "replays/score": 4238,
     "replays/sessions": 73,
     "replays/studies": 8977,
     "rig": 53,
-    "rig/base": 947,
-    "rig/channels": 2419,
+    "rig/base": 953,
+    "rig/channels": 2452,
     "rig/cli": 5351,
     "rig/physics": 5479,
     "rig/run": 1843,

@@ -1,0 +1,416 @@
+"""Signals: the one input of all plots, built from a run, a recording, or samples.
+
+Values are engineering values with their times; rows that are missing stay missing. Groups of a recording are read when
+they are used, only within the requested times, and only the last one is kept in memory.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replays.estimate.runs import split_at_breaks
+from rig.base import units
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.samples import Columns, Samples, merge_samples
+from rig.base.wire import sensor_key, truth_key
+from rig.channels.orbit import find_edges, fit_turns
+from rig.channels.table import ChannelTable
+from rig.physics.parameters import SI
+
+_AXIS = re.compile(r"(.*?)[ _.-]?([xy])", re.IGNORECASE)
+"""Name of a probe of a pair: a common part, and its direction."""
+_CLEARANCES = {"ring": (), "disk": ("shaft.arm_disk", "shaft.arm_ring")}
+"""Planes of the rig with a clearance circle, by the signal of their probes; the clearance of the ring is multiplied by
+the ratio of the arms."""
+TRUTH = "truth."
+"""Prefix of quantities of the model: `truth.normal_force`."""
+
+Load = Callable[[str, float, float], Samples]
+"""Function of a group and the times of its first and last row [s] that returns at least these rows."""
+
+
+class Pair(NamedTuple):
+    """Signals of two perpendicular probes, x to the right and y up.
+
+    Attributes:
+        name: Common part of the names.
+        names: Names of the two channels.
+        x, y: Displacements, without gaps in the values; rows may be missing, shape (n,).
+        samples: The same rows with times, numbers and unit.
+        clearance: Radius of the clearance circle, in the unit; None if it is not known.
+    """
+
+    name: str
+    names: tuple[str, str]
+    x: np.ndarray
+    y: np.ndarray
+    samples: Samples
+    clearance: float | None
+
+    @property
+    def unit(self) -> str:
+        """Unit of the displacements."""
+        return self.samples.units[0]
+
+
+@dataclass(frozen=True)
+class Runout:
+    """Run-out of probes: the waveform per revolution that remains at slow roll, as its Fourier components.
+
+    Attributes:
+        vectors: Components by channel: 1X, 2X, ..., relative to the keyphasor, in the channel's unit.
+    """
+
+    vectors: Mapping[str, np.ndarray]
+
+    def compute(self, channel: str, angle: np.ndarray) -> np.ndarray:
+        """Return the run-out of a channel at angles from the keyphasor's passage [rad], shape (n,)."""
+        waves = [np.real(vector * np.exp(1j * k * angle)) for k, vector in enumerate(self.vectors[channel], 1)]
+        return np.sum(waves, axis=0)
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Channels of one run, with keyphasor and clearance.
+
+    Attributes:
+        title: Name for the picture.
+        channels: Group and unit by channel, in the order of the table; truth last.
+        span_s: Times of the first and the last row [s].
+        load: Reads a group.
+        load_edges: Reads the keyphasor's passages between two times [s].
+        clearances: Clearance by channel, in its unit.
+        runout: Run-out to subtract.
+        probe_angles_deg: Directions of the x and the y probe, counter-clockwise from the right [degrees].
+    """
+
+    title: str
+    channels: Mapping[str, tuple[str, str]]
+    span_s: tuple[float, float]
+    load: Load
+    load_edges: Callable[[float, float], np.ndarray]
+    clearances: Mapping[str, float]
+    runout: Runout | None = None
+    probe_angles_deg: tuple[float, float] = (0.0, 90.0)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Measured channels, without the truth."""
+        return tuple(name for name in self.channels if not name.startswith(TRUTH))
+
+    @property
+    def edges_s(self) -> np.ndarray:
+        """Times of the keyphasor's passages [s], ascending, shape (n,)."""
+        edges_s = np.unique(self.load_edges(*self.span_s))
+        return edges_s[(edges_s >= self.span_s[0]) & (edges_s <= self.span_s[1])]
+
+    def require_edges(self, what: str) -> np.ndarray:
+        """Return the keyphasor's passages.
+
+        Raises:
+            InputError: There are fewer than two.
+        """
+        if len(edges_s := self.edges_s) < 2:
+            raise InputError(what, "drawn with at least two keyphasor passages", Words(f"{len(edges_s)}"))
+        return edges_s
+
+    def read(self, *names: str) -> Samples:
+        """Return channels, with the rows that all of them have, in order of time.
+
+        Raises:
+            UnknownNameError: A channel does not exist.
+            InputError: Channels have different rates.
+        """
+        for name in names:
+            if name not in self.channels:
+                raise UnknownNameError("channels", "channels of the data", name, self.channels)
+        groups = dict.fromkeys(self.channels[name][0] for name in names)
+        whole = merge_samples([self.load(group, *self.span_s) for group in groups]).select(*names)
+        first, last = self.span_s
+        kept = (whole.times_s >= first) & (whole.times_s <= last) & np.isfinite(whole.values).all(axis=1)
+        if not (np.diff(whole.times_s) > 0.0).all():  # rows arrived late or twice
+            order = np.unique(whole.times_s, return_index=True)[1]
+            rows: Any = order[kept[order]]
+        else:
+            rows = slice(None) if kept.all() else kept
+        times_s, values = whole.times_s[rows], whole.values[rows]
+        if self.runout is not None and (known := [name for name in names if name in self.runout.vectors]):
+            angle = 2.0 * math.pi * compute_revolutions(times_s, self.require_edges("run-out"))
+            values = values.copy()
+            for name in known:
+                values[:, names.index(name)] -= self.runout.compute(name, angle)
+        return replace(whole, times_s=times_s, index=whole.index[rows], values=values)
+
+    @property
+    def pairs(self) -> dict[str, tuple[str, str]]:
+        """Names of perpendicular probes by the common part of their names, lengths first."""
+        found: dict[tuple[str, str], dict[str, str]] = {}
+        for name in self.names:
+            if match := _AXIS.fullmatch(name):
+                found.setdefault((match[1], self.channels[name][1]), {})[match[2].lower()] = name
+        pairs = {stem or "x, y": (each["x"], each["y"]) for (stem, _), each in found.items() if len(each) == 2}
+        return dict(sorted(pairs.items(), key=lambda pair: not self.is_length(pair[1][0])))
+
+    def is_length(self, name: str) -> bool:
+        """Return whether a channel measures a length."""
+        return units.get_quantity(self.channels[name][1]) == "length"
+
+    def read_pair(self, name: str | None = None) -> Pair:
+        """Return the signals of two perpendicular probes, by default the first pair.
+
+        Raises:
+            InputError: There is no pair, or no row of it.
+            UnknownNameError: There is no pair of this name.
+        """
+        pairs = self.pairs
+        if not pairs:
+            raise InputError("channels", "with a pair of probes, such as disk_x and disk_y", ", ".join(self.names))
+        if name is None:
+            name = next(iter(pairs))
+        if name not in pairs:
+            raise UnknownNameError("pair", "a pair of probes", name, pairs)
+        names = pairs[name]
+        samples = self.read(*names)
+        if len(samples) < 2:
+            raise InputError("times", f"with samples of {name}", Words("{:g} to {:g} s".format(*self.span_s)))
+        directions = np.radians(self.probe_angles_deg)
+        readings = np.stack([np.cos(directions), np.sin(directions)], axis=1)
+        if abs(np.linalg.det(readings)) < 0.1:
+            raise InputError("probe_angles_deg", "two directions that differ", self.probe_angles_deg)
+        x, y = samples.values.T
+        if self.probe_angles_deg != (0.0, 90.0):
+            x, y = np.linalg.solve(readings, samples.values.T)
+        return Pair(name, names, x, y, samples, self.clearances.get(names[0]))
+
+
+def compute_revolutions(times_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
+    """Return the angle of the shaft from the first keyphasor passage [revolutions], shape (n,).
+
+    Monotone cubic between passages, so that the speed may change within a revolution; before the first and after the
+    last one, the mean speed of the nearest revolution.
+
+    Args:
+        times_s: Times [s], shape (n,).
+        edges_s: At least two passages [s], ascending.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    revolutions = PchipInterpolator(edges_s, np.arange(len(edges_s)))(np.clip(times_s, edges_s[0], edges_s[-1]))
+    revolutions += np.minimum(times_s - edges_s[0], 0.0) / (edges_s[1] - edges_s[0])
+    return revolutions + np.maximum(times_s - edges_s[-1], 0.0) / (edges_s[-1] - edges_s[-2])
+
+
+def fit_orders(
+    samples: Samples, values: np.ndarray, edges_s: np.ndarray, orders: tuple[int, ...] = (1,)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and synchronous components of each revolution, as of `rig.channels.orbit.fit_turns`.
+
+    Args:
+        samples: Times of the values.
+        values: Signals, shape (n, signals).
+        edges_s: Keyphasor passages [s].
+        orders: Multiples of the speed.
+    """
+    if len(edges_s) < 2:
+        return fit_turns(values, samples.times_s, edges_s, orders)
+    revolutions = compute_revolutions(samples.times_s, edges_s)
+    return fit_turns(values, samples.times_s, edges_s, orders, revolutions=revolutions)
+
+
+def find_pieces(samples: Samples) -> list[slice]:
+    """Return the rows between gaps, in order."""
+    return [slice(*piece) for piece in split_at_breaks(np.diff(samples.index) != 1)] if len(samples) else []
+
+
+def break_lines(breaks: np.ndarray, *columns: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield columns with a nan at each break, where a line is interrupted.
+
+    Args:
+        breaks: Whether a row does not continue the previous one, from the second row on, shape (n - 1,).
+        columns: Each of shape (n,).
+    """
+    at = np.flatnonzero(breaks) + 1
+    for column in columns:
+        yield np.insert(column.astype(float), at, np.nan)
+
+
+def measure_runout(source: Any, *, orders: int = 1, max_hz: float | None = None, **options: Any) -> Runout:
+    """Measure the run-out of all probes at slow roll, by averaging over revolutions.
+
+    Args:
+        source: A run, a recording or samples that contains slow roll.
+        orders: Number of components: 1 for the slow-roll vector (1X), 2 for 1X and 2X; 32 for the waveform.
+        max_hz: Largest speed of the revolutions used [Hz]; None for all.
+        options: Options of `read_signals`, such as `from_s` and `to_s`.
+
+    Raises:
+        InputError: There is no such revolution, or no probe.
+    """
+    signals = read_signals(source, **options)
+    edges_s, vectors = signals.require_edges("run-out"), dict[str, np.ndarray]()
+    for name in [name for pair in signals.pairs.values() for name in pair]:
+        samples = signals.read(name)
+        turns, fitted = fit_orders(samples, samples.values, edges_s, tuple(range(1, orders + 1)))
+        slow = np.diff(edges_s)[turns] >= (0.0 if max_hz is None else 1.0 / max_hz)
+        if not slow.any():
+            raise InputError("max_hz", f"above the speed of a whole revolution of {name}", max_hz)
+        vectors[name] = fitted[slow, 1:, 0].mean(axis=0)
+    if not vectors:
+        raise InputError("channels", "with a pair of probes, such as disk_x and disk_y", ", ".join(signals.names))
+    return Runout(vectors)
+
+
+def read_signals(
+    source: Any,
+    *,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    last_s: float | None = None,
+    runout: Runout | None = None,
+    probe_angles_deg: tuple[float, float] = (0.0, 90.0),
+) -> Signals:
+    """Return the signals of a run, a recording or samples.
+
+    Args:
+        source: A run, a recording, samples (of a run, a recording or a client), or signals.
+        from_s: Time of the first row [s]; None for the first.
+        to_s: Time of the last row [s]; None for the last.
+        last_s: Use only the end, of this length [s].
+        runout: Run-out to subtract, of `measure_runout`.
+        probe_angles_deg: Directions of the x and the y probe, counter-clockwise from the right [degrees]; (45, 135) for
+            probes 45 degrees right and left of the top.
+
+    Raises:
+        InputError: The source is of another kind, or has no rows in this interval.
+    """
+    if isinstance(source, Signals):
+        signals = source
+    elif isinstance(source, Columns):
+        signals = _read_samples(source)
+    elif hasattr(source, "sampled"):
+        signals = _read_run(source)
+    elif hasattr(source, "span_s") and hasattr(source, "edges"):
+        signals = _read_recording(source)
+    else:
+        raise InputError("source", "a run, a recording or samples", Words(type(source).__name__))
+    begin, end = signals.span_s
+    if last_s is not None and not last_s > 0.0:
+        raise InputError("last_s", "greater than 0", last_s)
+    first, last = begin if from_s is None else max(begin, from_s), end if to_s is None else min(end, to_s)
+    if not last > first:
+        raise InputError("from_s and to_s", f"within {begin:g} to {end:g} s", Words(f"{from_s} to {to_s}"))
+    if last_s is not None:
+        first = max(first, last - last_s)
+    return replace(
+        signals,
+        span_s=(first, last),
+        runout=signals.runout if runout is None else runout,
+        probe_angles_deg=(float(probe_angles_deg[0]), float(probe_angles_deg[1])),
+    )
+
+
+def _read_samples(source: Any) -> Signals:
+    """Return the signals of samples, with the pulses of a channel `keyphasor`."""
+    if not len(source):
+        raise InputError("samples", "with rows", Words("none"))
+    times_s, index = source.times_s, np.atleast_1d(source.index)
+    if len(index) < len(times_s):  # a client counts the first row only
+        index = index[0] + np.arange(len(times_s))
+    samples = Samples("", times_s, index, source.values, source.names, source.units, source.rate_hz)
+    pulses = find_edges(samples["keyphasor"], times_s) if "keyphasor" in samples.names else np.empty(0)
+    return Signals(
+        title="",
+        channels={name: ("", unit) for name, unit in zip(samples.names, samples.units, strict=True)},
+        span_s=(float(times_s[0]), float(times_s[-1])),
+        load=lambda *_: samples,
+        load_edges=lambda *_: pulses,
+        clearances={},
+    )
+
+
+def _read_run(run: Any) -> Signals:
+    """Return the signals of an offline run; its truth is in SI."""
+    truth = {TRUTH + name: run.unit(name) for name in run.names}
+    groups = run.groups
+
+    def load(group: str, *_: float) -> Samples:
+        if group != TRUTH:
+            return groups[group]
+        rate_hz = (len(run.times_s) - 1) / max(run.times_s[-1] - run.times_s[0], 1e-12)
+        index = np.arange(len(run.times_s))
+        return Samples("truth", run.times_s, index, run.signals, tuple(truth), tuple(truth.values()), rate_hz)
+
+    times_s = [table.times_s for table in run.sampled]
+    return Signals(
+        title=f"scene {run.simulation.scene.name}",
+        channels=_list_channels(run.table) | {name: (TRUTH, unit) for name, unit in truth.items()},
+        span_s=(float(min(each[0] for each in times_s)), float(max(each[-1] for each in times_s))),
+        load=load,
+        load_edges=lambda *_: run.edges_s,
+        clearances=_compute_clearances(run.table, run.simulation.parameters_document()["values"]),
+    )
+
+
+def _read_recording(recording: Any) -> Signals:
+    """Return the signals of a recording, which are read when they are used."""
+    tables = recording.catalogue.get("truth", {})
+    truth = {
+        f"{TRUTH}{column['name']}": (TRUTH + table, column["unit"])
+        for table in reversed(tables)
+        if truth_key(table) in recording.messages
+        for column in tables[table]["columns"]
+    }
+    if (span_s := recording.span_s) is None:
+        raise InputError("recording", "with rows", Words("none"))
+
+    @lru_cache(maxsize=1)
+    def load(group: str, first_s: float, last_s: float) -> Samples:
+        part = recording.between(first_s, last_s)
+        if not group.startswith(TRUTH):
+            return part.samples(group)
+        samples = part.truth(group.removeprefix(TRUTH))
+        return replace(samples, names=tuple(TRUTH + name for name in samples.names))
+
+    @lru_cache(maxsize=4)
+    def load_edges(first_s: float, last_s: float) -> np.ndarray:
+        edges_s = recording.between(first_s, last_s).edges()
+        if not len(edges_s) and "keyphasor" in recording.table.channels:
+            pulses = recording.between(first_s, last_s).samples("keyphasor")
+            edges_s = find_edges(pulses["keyphasor"], pulses.times_s)
+        return edges_s
+
+    listed = _list_channels(recording.table)
+    return Signals(
+        title=f"{recording.path.name}, scene {recording.scene.get('name')}",
+        channels={name: one for name, one in listed.items() if sensor_key(one[0]) in recording.messages} | truth,
+        span_s=span_s,
+        load=load,
+        load_edges=load_edges,
+        clearances=_compute_clearances(recording.table, recording.parameters.get("values", {})),
+    )
+
+
+def _list_channels(table: ChannelTable) -> dict[str, tuple[str, str]]:
+    return {name: (channel.group, channel.unit) for name, channel in table.channels.items()}
+
+
+def _compute_clearances(table: ChannelTable, values: Mapping[str, Any]) -> dict[str, float]:
+    """Return the clearance of each probe in a plane with a clearance, in its unit."""
+    found: dict[str, float] = {}
+    for name, channel in table.channels.items():
+        plane = _CLEARANCES.get(channel.signal.rpartition("_")[0])
+        if plane is None or any(key not in values for key in ("ring.clearance", *plane)):
+            continue
+        sizes = [
+            float(entry.get("resolved", entry["value"])) * SI[entry["unit"]]
+            for entry in (values[key] for key in ("ring.clearance", *plane))
+        ]
+        found[name] = sizes[0] / channel.si * (sizes[1] / sizes[2] if plane else 1.0)
+    return found
