@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+import os
+import select
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Thread
+from typing import IO, Any
 
 import numpy as np
 import rerun as rr
@@ -34,6 +40,41 @@ def new_stream(name: str, *, batch_s: float = VIEWING_BATCH_S) -> rr.RecordingSt
     stream.set_log_time_enabled(False)
     stream.send_recording_name(name)
     return stream
+
+
+@contextmanager
+def piped(file: IO[bytes]) -> Iterator[Path]:
+    """Yield a pipe whose data are written to a file: rerun waits for ever if the disk refuses a file of its own.
+
+    Raises:
+        OSError: The disk refused; the rest of the data was discarded.
+    """
+    failures: list[OSError] = []
+
+    def copy() -> None:
+        events = select.poll()
+        events.register(number, select.POLLIN)
+        while any(event & select.POLLIN for _, event in events.poll()):
+            data = os.read(number, 1 << 20)
+            try:
+                file.write(b"" if failures else data)
+            except OSError as error:
+                failures.append(error)
+
+    with TemporaryDirectory() as folder:
+        pipe = Path(folder) / "pipe"
+        os.mkfifo(pipe, 0o600)
+        number = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+        copier = Thread(target=copy, name="file of the viewer", daemon=True)
+        copier.start()
+        try:
+            yield pipe
+        finally:
+            os.close(os.open(pipe, os.O_WRONLY))  # ends the copier, also if rerun never opened the pipe
+            copier.join()
+            os.close(number)
+    if failures:
+        raise failures[0]
 
 
 def pixels(size: float) -> list[float]:

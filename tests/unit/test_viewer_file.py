@@ -13,7 +13,7 @@ import pytest
 from recorder.files.schemas import event_text
 from recorder.reader import Recording
 from recorder.viewer import blueprint, file
-from recorder.viewer.canvas import Canvas, new_stream
+from recorder.viewer.canvas import Canvas, new_stream, piped
 from recorder.viewer.drawings import spectrum
 from recorder.viewer.drawings.geometry import Geometry
 from recorder.viewer.painter import list_missing_views
@@ -362,3 +362,20 @@ def test_faults_and_commands_are_marks_from_begin_to_end(tmp_path: Path) -> None
         marks = saved[f"/marks/{lane}", "StateChange:state"]
         found = [(round(time_s, 6), state) for time_s, (state,) in zip(marks.times_s, marks.values, strict=True)]
         assert found == expected
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is always full")
+@pytest.mark.parametrize("size", [10, 1 << 20])
+def test_a_full_disk_does_not_stop_the_writer_of_a_pipe(size: int) -> None:
+    full = Path("/dev/full").open("wb", buffering=0)  # noqa: SIM115
+    with pytest.raises(OSError, match="No space"), full as file, piped(file) as pipe:
+        pipe.write_bytes(bytes(size))
+
+
+def test_a_pipe_passes_all_bytes_and_ends_unused(tmp_path: Path) -> None:
+    data = np.random.default_rng(1).bytes(1 << 20)
+    for sent in (data, None):
+        with (tmp_path / "file").open("wb") as file, piped(file) as pipe:
+            if sent is not None:
+                pipe.write_bytes(sent)
+        assert (tmp_path / "file").read_bytes() == (sent or b"")

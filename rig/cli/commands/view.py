@@ -231,15 +231,20 @@ def _saved(
         plan: The blueprint.
         until_interrupted: Keep the file after Ctrl-C.
     """
-    with whole_file(path) as part:
-        stream.save(part, default_blueprint=plan)
-        with suppress(*([KeyboardInterrupt] if until_interrupted else [])):
-            yield
-        stream.flush(timeout_sec=60.0)  # raises if the disk refused; then there is nothing to disconnect
-        stream.disconnect()
-        # rerun only logs a refusal of the disk; a complete file ends with its table of contents.
-        with part.open("rb") as file:
-            file.seek(max(0, part.stat().st_size - 64))
+    from recorder.viewer.canvas import piped
+
+    with whole_file(path) as draft:
+        with draft.open("wb") as file, piped(file) as pipe:
+            stream.save(pipe, default_blueprint=plan)
+            try:
+                with suppress(*([KeyboardInterrupt] if until_interrupted else [])):
+                    yield
+                stream.flush(timeout_sec=60.0)
+            finally:
+                stream.disconnect()
+        # rerun only logs a failure; a complete file ends with its table of contents.
+        with draft.open("rb") as file:
+            file.seek(max(0, draft.stat().st_size - 64))
             if b"RRF2FOOT" not in file.read():
                 raise DiskError(f"{path} could not be written completely; it was removed")
 
