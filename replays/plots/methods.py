@@ -2,21 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from inspect import signature
 from typing import Any
 
 from replays.plots.orbits import centreline, orbit
 from replays.plots.plot import Plot
+from replays.plots.signals import Signals
+from replays.plots.spectra import cascade, full_spectrum, orders, waterfall
+from replays.plots.synchronous import bode, polar, trend
 from replays.plots.timebase import timebase
 from rig.base.errors import UnknownNameError
 
 KINDS: Mapping[str, Callable[..., Plot]] = {
-    "timebase": timebase,
     "orbit": orbit,
+    "full_spectrum": full_spectrum,
+    "timebase": timebase,
     "centreline": centreline,
+    "waterfall": waterfall,
+    "cascade": cascade,
+    "orders": orders,
+    "bode": bode,
+    "polar": polar,
+    "trend": trend,
 }
 """Functions by name, in the order of `rig plot`."""
+
+
+def list_pictures(signals: Signals, kinds: Sequence[str] = ()) -> dict[str, Callable[[], Plot]]:
+    """Return functions that draw all pictures of the data, by file name.
+
+    A kind with an option `pair` or `channels` has a picture for each pair of displacement probes, a timebase one for
+    each group.
+
+    Args:
+        signals: The data.
+        kinds: Kinds to draw; none for all.
+
+    Raises:
+        UnknownNameError: A kind does not exist.
+    """
+    for name in kinds:
+        if name not in KINDS:
+            raise UnknownNameError("--only", "kinds of plots", name, KINDS)
+    pairs = list(signals.pairs)
+    pairs = [name for name in pairs if signals.is_length(signals.pairs[name][0])] or pairs[:1]
+    groups: dict[str, list[str]] = {}
+    for name in signals.names:
+        groups.setdefault(signals.channels[name][0], []).append(name)
+    pictures: dict[str, Callable[[], Plot]] = {}
+    for kind, function in KINDS.items():
+        each: dict[str, dict[str, Any]] = {"": {}}
+        if kind == "timebase":
+            each = {group: {"channels": names} for group, names in groups.items()}
+        elif pairs and (option := {"pair", "channels"} & signature(function).parameters.keys()):
+            each = {pair: dict.fromkeys(option, pair) for pair in pairs}
+        for name, options in each.items() if kind in (kinds or KINDS) else ():
+            pictures[re.sub(r"[^\w.-]+", "_", f"{kind}-{name}").rstrip("-")] = partial(function, signals, **options)
+    return pictures
 
 
 class _UnknownKindError(UnknownNameError, AttributeError):

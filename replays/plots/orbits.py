@@ -12,13 +12,17 @@ from replays.plots.plot import Plot, Table, describe_frame, describe_span, descr
 from replays.plots.signals import Pair, Signals, break_lines, compute_revolutions, fit_orders
 from replays.report.canvas import BLACK, BLUE, RED, axis_label
 from rig.base.errors import InputError, UnknownNameError
-from rig.channels.orbit import whirl_frequency
+from rig.channels.orbit import mean_rotation, whirl_frequency
 
 COMPONENTS = ("raw", "1X", "2X")
 _ORBIT_S = 1.0
 """Length of the end of the data that an orbit shows by default [s]; longer orbits are solid areas."""
 _STILL = 1e-9
 """Ratio of forward and backward amplitude within which the orbit is a line, which has no sense of rotation."""
+_MIN_WHIRLS = 2.0
+"""Revolutions of the whirl from which its frequency is given."""
+_MIN_PATH = 0.2
+"""Size of a path relative to the clearance, below which it is drawn without the circle."""
 _LOOP = 180
 """Points of a filtered orbit."""
 _BLOCK_S = 0.1
@@ -61,7 +65,9 @@ def orbit(
         raise InputError("components", "raw, as there is no whole revolution in these data", list(components))
     shown = list(components) or list(COMPONENTS if len(turns) else COMPONENTS[:1])
     radius = probes.clearance if clearance is None else clearance
-    note = f"{describe_frame(signals)}; dots: the keyphasor notch passes" + "; dashed: clearance" * bool(radius)
+    note = f"{describe_frame(signals)}; dots: the keyphasor notch passes" + "; dashed: clearance, if it is near" * bool(
+        radius
+    )
     title = f"{describe_title(signals, f'Orbit at {probes.name}')}, {describe_span(probes)}"
     panels = make_axes(axes, 1, len(shown), height=4.4 if len(shown) > 1 else 6.5, title=title, note=note)
     columns: dict[str, tuple[str, Any]] = {"time": ("s", times_s)}
@@ -75,31 +81,36 @@ def orbit(
             path, dots, rows, caption = _follow_ellipse(vectors, probes.unit)
             values = _rebuild(vectors, 2.0 * math.pi * order * compute_revolutions(times_s, edges_s))
         columns |= {f"x {name}": (probes.unit, values.real), f"y {name}": (probes.unit, values.imag)}
-        if radius and name == "raw":
-            circle = radius * np.exp(2j * math.pi * np.linspace(0.0, 1.0, 361))
-            panel.plot(circle.real, circle.imag, color=BLACK, ls="--", lw=0.9)
         panel.plot(path.real, path.imag, color=BLUE, lw=0.7 if name == "raw" else 1.4)
         begin = len(path) - 1 - 3 * rows // 4
-        tail, tip = path[begin], path[begin + max(1, rows // 60)]
-        if abs(tip - tail) > 0.0:
+        tail, tip = path[begin], path[min(begin + max(1, rows // 60), len(path) - 1)]
+        if rows and abs(tip - tail) > 0.0:
             arrow = {"arrowstyle": "-|>", "color": BLACK, "mutation_scale": 16, "shrinkA": 0, "shrinkB": 0}
             panel.annotate("", (tip.real, tip.imag), (tail.real, tail.imag), arrowprops=arrow)
         panel.plot(dots.real, dots.imag, "o", ms=4.5, color=RED)
-        panel.set(title=f"{name}: {caption}", aspect="equal", xlabel=axis_label("x", probes.unit))
-        _set_square(panel)
+        panel.set(title=f"{name}{caption}", xlabel=axis_label("x", probes.unit))
+        _finish(panel, radius if name == "raw" else None)
     panels[0].set_ylabel(axis_label("y", probes.unit))
     return Plot(tuple(panels), Table.from_columns(note, **columns))
 
 
 def _follow_raw(probes: Pair, edges_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, str]:
-    """Return the path of the raw orbit, its points at the keyphasor's passages, rows per revolution, and a caption."""
+    """Return the path of the raw orbit, its points at the keyphasor's passages, rows per whirl, and a caption.
+
+    The rows are 0 without a steady whirl.
+    """
     times_s = probes.samples.times_s
     lines = list(break_lines(np.diff(probes.samples.index) != 1, times_s, probes.x, probes.y))
     inside = edges_s[(edges_s >= times_s[0]) & (edges_s <= times_s[-1])]
     dots = np.interp(inside, lines[0], lines[1]) + 1j * np.interp(inside, lines[0], lines[2])
-    hz = whirl_frequency(probes.x, probes.y, times_s)
-    rows = min(round(probes.samples.rate_hz / max(abs(hz), 1.0)), len(times_s) - 2)
-    return lines[1] + 1j * lines[2], dots, rows, f"{'forward' if hz > 0.0 else 'backward'}\n{abs(hz):.2f} Hz"
+    path, hz = lines[1] + 1j * lines[2], whirl_frequency(probes.x, probes.y, times_s)
+    steady = (
+        abs(hz) * np.ptp(times_s) > _MIN_WHIRLS and hz * mean_rotation(probes.x, probes.y, probes.samples.rate_hz) > 0.0
+    )
+    if not steady:
+        return path, dots, 0, "\n"
+    rows = min(round(probes.samples.rate_hz / abs(hz)), len(path) - 2)
+    return path, dots, rows, f": {'forward' if hz > 0.0 else 'backward'}\n{abs(hz):.2f} Hz"
 
 
 def _follow_ellipse(vectors: np.ndarray, unit: str) -> tuple[np.ndarray, np.ndarray, int, str]:
@@ -113,7 +124,7 @@ def _follow_ellipse(vectors: np.ndarray, unit: str) -> tuple[np.ndarray, np.ndar
     forward, backward = abs(vectors[0] + 1j * vectors[1]) / 2.0, abs(vectors[0] - 1j * vectors[1]) / 2.0
     major, minor = forward + backward, abs(forward - backward)
     sense = "a line" if minor <= _STILL * major else "forward" if forward > backward else "backward"
-    return path, path[:1], _LOOP, f"{sense}\nhalf axes {major:.3g}, {minor:.2g} {unit}"
+    return path, path[:1], _LOOP, f": {sense}\nhalf axes {major:.3g}, {minor:.2g} {unit}"
 
 
 def _rebuild(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -122,12 +133,20 @@ def _rebuild(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return waves[:, 0] + 1j * waves[:, 1]
 
 
-def _set_square(panel: Any) -> None:
-    """Set limits of equal length around the lines of a panel."""
+def _finish(panel: Any, radius: float | None) -> None:
+    """Draw the clearance circle, unless the path would be a dot in it, and set limits of equal length."""
     (left, bottom), (right, top) = panel.dataLim.min, panel.dataLim.max
     half = 0.56 * max(right - left, top - bottom) or 1.0
     x, y = 0.5 * (left + right), 0.5 * (bottom + top)
-    panel.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    if radius and max(half, abs(x), abs(y)) < _MIN_PATH * radius:
+        panel.set_title(
+            f"clearance {radius:.3g} lies outside", loc="right", fontsize=8, fontweight="normal", color="0.35"
+        )
+    elif radius:
+        circle = radius * np.exp(2j * math.pi * np.linspace(0.0, 1.0, 361))
+        panel.plot(circle.real, circle.imag, color=BLACK, ls="--", lw=0.9)
+        half, x, y = max(1.1 * radius, half + max(abs(x), abs(y))), 0.0, 0.0
+    panel.set(aspect="equal", xlim=(x - half, x + half), ylim=(y - half, y + half))
     panel.locator_params(nbins=5)
 
 
@@ -158,12 +177,9 @@ def centreline(signals: Signals, *, pair: str | None = None, clearance: float | 
     )
     title = f"{describe_title(signals, f'Shaft centreline at {probes.name}')}, {describe_span(probes)}"
     (panel,) = make_axes(axes, 1, 1, height=6.5, title=title, note=note)
-    if radius:
-        circle = radius * np.exp(2j * math.pi * np.linspace(0.0, 1.0, 361))
-        panel.plot(circle.real, circle.imag, color=BLACK, ls="--", lw=0.9)
     panel.plot(*break_lines(np.diff(turns) != 1, x, y), ".-", color=BLUE, lw=0.9, ms=4)
     panel.plot(x[-1:], y[-1:], "o", ms=6, color=RED)
-    panel.set(aspect="equal", xlabel=axis_label("x", probes.unit), ylabel=axis_label("y", probes.unit))
-    _set_square(panel)
+    panel.set(xlabel=axis_label("x", probes.unit), ylabel=axis_label("y", probes.unit))
+    _finish(panel, radius)
     columns = {"time": ("s", at_s), "speed": ("Hz", speed_hz), "x": (probes.unit, x), "y": (probes.unit, y)}
     return Plot((panel,), Table.from_columns(note, **columns))

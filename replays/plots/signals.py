@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from rig.base import units
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.samples import Columns, Samples, merge_samples
 from rig.base.wire import sensor_key, truth_key
-from rig.channels.orbit import find_edges, fit_turns
+from rig.channels.orbit import PULSE_LEVEL, find_edges, fit_turns
 from rig.channels.table import ChannelTable
 from rig.physics.parameters import SI
 
@@ -158,6 +158,23 @@ class Signals:
         pairs = {stem or "x, y": (each["x"], each["y"]) for (stem, _), each in found.items() if len(each) == 2}
         return dict(sorted(pairs.items(), key=lambda pair: not self.is_length(pair[1][0])))
 
+    def list_channels(self, names: Sequence[str] | str = ()) -> list[str]:
+        """Return channels by their names or those of pairs; without names, the first pair.
+
+        Raises:
+            InputError: There are no names and no pair.
+        """
+        if isinstance(names, str):
+            names = [names]
+        pairs = self.pairs
+        if not (names or pairs):
+            raise InputError("channels", "with a pair of probes, such as disk_x and disk_y", ", ".join(self.names))
+        return [each for name in names or list(pairs)[:1] for each in pairs.get(name, (name,))]
+
+    def get_direction_deg(self, name: str) -> float:
+        """Return the direction of a probe, counter-clockwise from the right [degrees]."""
+        return self.probe_angles_deg[any(name == y for _, y in self.pairs.values())]
+
     def is_length(self, name: str) -> bool:
         """Return whether a channel measures a length."""
         return units.get_quantity(self.channels[name][1]) == "length"
@@ -222,6 +239,17 @@ def fit_orders(
         return fit_turns(values, samples.times_s, edges_s, orders)
     revolutions = compute_revolutions(samples.times_s, edges_s)
     return fit_turns(values, samples.times_s, edges_s, orders, revolutions=revolutions)
+
+
+def check_speeds(speed_hz: np.ndarray) -> None:
+    """Raise an error unless the speed changes by a tenth.
+
+    Raises:
+        InputError: It does not.
+    """
+    if speed_hz.max(initial=0.0) < 1.1 * speed_hz.min(initial=np.inf):
+        received = Words(f"{speed_hz.min():.2f} to {speed_hz.max():.2f} Hz" if len(speed_hz) else "none")
+        raise InputError("speed", "that of a run-up or a coast-down, which changes by a tenth", received)
 
 
 def find_pieces(samples: Samples) -> list[slice]:
@@ -324,7 +352,7 @@ def _read_samples(source: Any) -> Signals:
     if len(index) < len(times_s):  # a client counts the first row only
         index = index[0] + np.arange(len(times_s))
     samples = Samples("", times_s, index, source.values, source.names, source.units, source.rate_hz)
-    pulses = find_edges(samples["keyphasor"], times_s) if "keyphasor" in samples.names else np.empty(0)
+    pulses = _find_pulses(samples) if "keyphasor" in samples.names else np.empty(0)
     return Signals(
         title="",
         channels={name: ("", unit) for name, unit in zip(samples.names, samples.units, strict=True)},
@@ -382,8 +410,7 @@ def _read_recording(recording: Any) -> Signals:
     def load_edges(first_s: float, last_s: float) -> np.ndarray:
         edges_s = recording.between(first_s, last_s).edges()
         if not len(edges_s) and "keyphasor" in recording.table.channels:
-            pulses = recording.between(first_s, last_s).samples("keyphasor")
-            edges_s = find_edges(pulses["keyphasor"], pulses.times_s)
+            edges_s = _find_pulses(recording.between(first_s, last_s).samples("keyphasor"))
         return edges_s
 
     listed = _list_channels(recording.table)
@@ -395,6 +422,12 @@ def _read_recording(recording: Any) -> Signals:
         load_edges=load_edges,
         clearances=_compute_clearances(recording.table, recording.parameters.get("values", {})),
     )
+
+
+def _find_pulses(samples: Samples) -> np.ndarray:
+    """Return the times of the pulses of a channel `keyphasor` [s]; none at standstill, even with noise at the level."""
+    signal = samples["keyphasor"]
+    return find_edges(signal, samples.times_s) if len(signal) and np.ptp(signal) > PULSE_LEVEL else np.empty(0)
 
 
 def _list_channels(table: ChannelTable) -> dict[str, tuple[str, str]]:

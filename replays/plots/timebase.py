@@ -46,15 +46,14 @@ def timebase(signals: Signals, *, channels: Sequence[str] = (), axes: Any = None
 
     Args:
         signals: The data.
-        channels: Channels, or `truth.NAME`; none for all measured channels.
+        channels: Channels, pairs such as `disk`, or `truth.NAME`; none for all measured channels.
         axes: Axes to draw on, one for each channel; None for a new figure.
 
     Returns:
         Axes and table; the table has the times and values drawn, of an envelope `NAME.min` and `NAME.max`.
     """
-    if isinstance(channels, str):
-        channels = [channels]
-    names = list(channels) or [name for name in signals.names if name != "keyphasor"] or list(signals.names)
+    names = [name for name in signals.names if name != "keyphasor"] or list(signals.names)
+    names = signals.list_channels(channels or names)
     edges_s = signals.edges_s
     traces = [_build_trace(signals, name) for name in names]
     marked = 0 < len(edges_s) <= _MAX_MARKS

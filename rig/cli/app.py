@@ -60,6 +60,7 @@ COMMANDS = {
     "Recordings": {
         "record": "Record all streams of a running rig to FILE.mcap, without loss",
         "view": "View a recording, or the running rig, in rerun",
+        "plot": "Draw orbit, spectra, Bode plot and others of a recording",
         "info": "Show the calibration, gaps, health and events of a recording",
         "cut": "Cut a part from a recording, or join the files of a run",
         "recover": "Recover recordings that were cut off or damaged",
@@ -107,7 +108,7 @@ GROUPS = {
 
 NEED_FULL = (
     "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
-    "score", "campaign", "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
+    "score", "plot", "campaign", "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
 )  # fmt: skip
 """Commands that a lean install lacks; of `keys` it has the subcommands."""
 

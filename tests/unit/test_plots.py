@@ -162,10 +162,11 @@ def test_a_run_a_recording_and_samples_give_the_same_orbit(tmp_path: Path) -> No
     ours = run.plot.orbit(last_s=0.2)
     assert recording.plot.orbit(last_s=0.2).table.values == pytest.approx(ours.table.values, abs=1e-9)
     assert run.samples.plot.orbit(last_s=0.2).table["x raw"].tolist() == ours.table["x raw"].tolist()
-    circle = ours.axes[0].lines[0].get_xydata()
+    circle = next(line for line in ours.axes[0].lines if line.get_linestyle() == "--").get_xydata()
     assert np.hypot(*circle.T) == pytest.approx(0.926 * 314.0 / 197.0, rel=1e-3), "the ring's clearance, at the disk"
-    ring = run.plot.orbit(pair="ring", last_s=0.05).axes[0].lines[0].get_xydata()
-    assert np.hypot(*ring.T) == pytest.approx(0.926, rel=1e-3)
+    wide = run.plot.orbit(pair="ring", last_s=0.05, clearance=2.0).axes[0]
+    circle = next(line for line in wide.lines if line.get_linestyle() == "--").get_xydata()
+    assert np.hypot(*circle.T) == pytest.approx(2.0)
     force = run.plot.timebase(channels=["truth.normal_force"], from_s=0.3).table
     assert force["truth.normal_force"] == pytest.approx(run["normal_force"][run.times_s >= 0.3], rel=1e-12)
 
@@ -203,6 +204,15 @@ def test_wrong_arguments_name_the_nearest(call: Any, message: str) -> None:
         call(build_whirl(0.3, 0.1).plot)
 
 
+def test_noise_of_a_keyphasor_at_standstill_is_no_passage() -> None:
+    noise = 0.5 + 1e-3 * np.random.default_rng(1).normal(size=1000)
+    samples = build_whirl(0.3, 0.1, duration_s=0.2)
+    still = np.column_stack([samples.values[:, :2], noise])
+    rest = Samples("", samples.times_s, samples.index, still, samples.names, samples.units, RATE_HZ)
+    assert len(read_signals(rest).edges_s) == 0
+    assert len(read_signals(samples).edges_s) == 2
+
+
 def test_unknown_methods_are_no_attributes() -> None:
     plot = build_whirl(0.3, 0.1).plot
     assert dir(plot) == sorted(KINDS)
@@ -214,11 +224,187 @@ def test_unknown_methods_are_no_attributes() -> None:
 
 
 @pytest.mark.parametrize("name", list(KINDS))
-def test_every_kind_draws_a_recording_without_a_warning(name: str, tmp_path: Path) -> None:
-    plot = getattr(Recording.open(SESSION).plot, name)()
+def test_every_kind_draws_without_a_warning(name: str, tmp_path: Path) -> None:
+    plot = getattr(build_resonance().plot, name)()
     assert isinstance(plot, Plot)
     assert len(plot.table) > 1
-    assert plot.table.note
     figure: Any = plot.axes[0].figure
-    assert figure.get_supxlabel() == plot.table.note
+    assert figure.get_supxlabel() == plot.table.note != ""
     assert all(path.stat().st_size > 100 for path in plot.save(tmp_path / f"{name}.svg", table=".parquet"))
+    axes = [*plot.axes]
+    again = KINDS[name](build_resonance(), axes=axes)
+    assert [*again.axes] == axes, "drawn on the caller's axes"
+
+
+def respond(speed_hz: np.ndarray) -> np.ndarray:
+    """Return amplitude and phase of a rotor with unbalance, natural frequency 8 Hz, damping ratio 0.1."""
+    ratio = speed_hz / 8.0
+    return 0.02 * ratio**2 / (1.0 - ratio**2 + 2j * 0.1 * ratio)
+
+
+def build_resonance(speed_hz: tuple[float, float] = (3.0, 13.0)) -> Samples:
+    """Return a run-up in which each instant has the stationary response, on x and, a quarter later, on y."""
+
+    def follow(times_s: np.ndarray, angle: np.ndarray, lag: float) -> np.ndarray:
+        speeds = np.interp(times_s, [0.0, times_s[-1]], speed_hz)
+        return np.real(respond(speeds) * np.exp(1j * (angle - lag)))
+
+    return build_samples(
+        30.0,
+        speed_hz=speed_hz,
+        disk_x=lambda times_s, angle: follow(times_s, angle, 0.0),
+        disk_y=lambda times_s, angle: follow(times_s, angle, 0.5 * math.pi),
+    )
+
+
+@pytest.mark.parametrize("speed_hz", [(3.0, 13.0), (13.0, 3.0)])
+@pytest.mark.parametrize("name", ["bode", "polar", "trend"])
+def test_bode_polar_and_trend_show_the_transfer_function(name: str, speed_hz: tuple[float, float]) -> None:
+    axes, table = getattr(build_resonance(speed_hz).plot, name)()
+    expected = respond(table["speed"])
+    assert table["time"] == pytest.approx((table["speed"] - speed_hz[0]) / np.diff(speed_hz) * 30.0, abs=0.02)
+    assert len(table) > 200
+    for channel, lag in (("disk_x", 0.0), ("disk_y", 90.0)):
+        vectors = table[f"{channel} 1X"] * np.exp(-1j * np.radians(table[f"{channel} 1X lag"] - lag))
+        assert np.abs(vectors - expected).max() < 0.01 * np.abs(expected).max()
+        # A component that changes within a revolution is not purely 1X.
+        assert table[f"{channel} 2X"].max() < 0.02 * np.abs(expected).max()
+    assert (table["disk_x 1X lag"] % 360.0 >= 0.0).all()
+    at_resonance = int(np.argmin(np.abs(table["speed"] - 8.0)))
+    assert table["disk_x 1X lag"][at_resonance] == pytest.approx(90.0, abs=4.0)
+    if name == "bode":
+        way = "run-up" if speed_hz[1] > speed_hz[0] else "coast-down"
+        assert [line.get_label() for line in axes[2].lines] == [f"disk_x, {way}", f"disk_y, {way}"]
+        assert axes[0].get_ylim()[0] > axes[0].get_ylim()[1], "the lag increases downwards"
+    if name == "polar":
+        assert [axis.get_theta_offset() for axis in axes] == pytest.approx([0.0, math.pi / 2.0] * 2)
+        assert [axis.get_theta_direction() for axis in axes] == [-1] * 4, "the lag is against the rotation"
+
+
+def test_slow_roll_is_subtracted_from_a_bode_plot() -> None:
+    clean = build_resonance()
+    angle = np.interp(clean.times_s, read_signals(clean).edges_s, np.arange(len(read_signals(clean).edges_s)))
+    values = clean.values.copy()
+    values[:, 0] += 0.1 * np.cos(2.0 * math.pi * angle - 1.0)
+    bent = Samples("", clean.times_s, clean.index, values, clean.names, clean.units, RATE_HZ)
+    vector = measure_runout(bent, max_hz=3.5).vectors["disk_x"]
+    assert vector == pytest.approx(0.1 * np.exp(-1j) + respond(np.array([3.3])), abs=0.002), "with the response there"
+    table = bent.plot.bode(channels="disk_x", orders=[1], runout=measure_runout(bent, max_hz=3.5)).table
+    expected = respond(table["speed"]) - respond(np.array([3.3]))
+    assert table["disk_x 1X"][2:-2] == pytest.approx(np.abs(expected)[2:-2], abs=0.003)
+
+
+def test_bode_needs_a_keyphasor_and_a_changing_speed() -> None:
+    with pytest.raises(InputError, match=r"speed must be that of a run-up .*; received 7.00 to 7.00 Hz"):
+        build_whirl(0.3, 0.1).plot.bode()
+    with pytest.raises(InputError, match="Bode must be drawn with at least two keyphasor passages; received 0"):
+        build_whirl(0.3, 0.1).select("disk_x", "disk_y").plot.bode()
+    with pytest.raises(InputError, match="orders must be whole numbers from 1 to 100; received 0"):
+        build_whirl(0.3, 0.1).plot.trend(orders=[0])
+
+
+def test_spectra_show_a_known_chirp() -> None:
+    from scipy.signal import chirp
+
+    times_s = np.arange(round(10.0 * RATE_HZ)) / RATE_HZ
+    x, y = (0.25 * chirp(times_s, 20.0, 10.0, 60.0, phi=phi) for phi in (0.0, 90.0))  # backward: y = -sin
+    samples = Samples(
+        "", times_s, np.arange(len(times_s)), np.column_stack([x, y]), ("a_x", "a_y"), ("mm",) * 2, RATE_HZ
+    )
+    table = samples.plot.waterfall(window_s=0.5).table
+    for at_s in np.unique(table["time"])[::10]:
+        rows = table["time"] == at_s
+        power = table["amplitude"][rows] ** 2
+        assert np.sum(table["frequency"][rows] * power) / power.sum() == pytest.approx(-(20.0 + 4.0 * at_s), rel=0.01)
+    gap = drop_rows(samples, 4.0, 6.0).plot.waterfall(window_s=0.5).table
+    empty = np.unique(gap["time"][np.isnan(gap["amplitude"])])
+    assert len(empty) == 2
+    assert 3.7 < empty[0] < empty[1] < 6.3
+    assert not ((gap["time"] > empty[0]) & (gap["time"] < empty[1])).any()
+
+
+def test_full_spectrum_and_cascade_separate_forward_and_backward() -> None:
+    def build(sign: float) -> Any:
+        function = np.cos if sign > 0.0 else np.sin
+        return lambda times_s, _: (
+            0.3 * function(80.0 * math.pi * times_s) + sign * 0.1 * function(50.0 * math.pi * times_s)
+        )
+
+    samples = build_samples(20.0, speed_hz=(2.0, 12.0), disk_x=build(1.0), disk_y=build(-1.0))
+    table = samples.plot.full_spectrum().table
+    for hz, amplitude in ((40.0, 0.3), (-25.0, 0.1)):
+        assert table["amplitude"][np.argmin(np.abs(table["frequency"] - hz))] == pytest.approx(amplitude, rel=0.01)
+        assert table["amplitude"][np.argmin(np.abs(table["frequency"] + hz))] < 1e-4
+    (axes,), table = samples.plot.cascade(window_s=1.0)
+    for hz, amplitude in ((40.0, 0.3), (-25.0, 0.1)):
+        assert table["amplitude"][np.abs(table["frequency"] - hz) < 1e-6] == pytest.approx(amplitude, rel=0.01)
+    speeds = np.unique(table["speed"])
+    assert speeds[[0, -1]] == pytest.approx([2.25, 11.75], abs=0.15)
+    assert 30 <= len(speeds) <= 40
+    assert axes.get_ylabel() == "speed [Hz]"
+
+
+def test_orders_follow_the_speed() -> None:
+    table = build_whirl(0.3, 0.05, order=2.5, speed_hz=(2.0, 12.0), duration_s=20.0).plot.orders(max_order=4.0).table
+    for order, amplitude in ((2.5, 0.3), (-2.5, 0.05)):
+        assert table["amplitude"][table["order"] == order] == pytest.approx(amplitude, rel=0.01)
+    apart = np.abs(np.abs(table["order"]) - 2.5) > 0.3
+    assert table["amplitude"][apart].max() < 0.003
+    assert np.abs(table["order"]).max() == 4.0
+    gap = drop_rows(build_whirl(0.3, 0.05, duration_s=10.0), 4.0, 6.0).plot.orders().table
+    assert not ((gap["time"] > 3.5) & (gap["time"] < 6.5)).any()
+
+
+@pytest.mark.parametrize("count", [1, 24])
+def test_any_number_of_channels_is_drawn(count: int, tmp_path: Path) -> None:
+    samples = build_samples(0.2, **{f"c{n}": lambda times_s, _: np.sin(50.0 * times_s) for n in range(count)})
+    plot = samples.plot.timebase()
+    assert len(plot.axes) == count
+    assert plot.save(tmp_path / "timebase.png")
+    with pytest.raises(InputError, match="channels must be with a pair of probes, such as disk_x and disk_y"):
+        samples.plot.orbit()
+
+
+def rig_plot(*arguments: object) -> int:
+    from rig.cli.main import main
+
+    with pytest.raises(SystemExit) as end:
+        main(["plot", *map(str, arguments)])
+    return int(end.value.code or 0)
+
+
+def test_the_command_draws_each_pair_and_group(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = {name: KINDS[name] for name in ("orbit", "timebase", "bode")}
+    monkeypatch.setattr("replays.plots.methods.KINDS", few)
+    assert rig_plot(SESSION, "-o", tmp_path / "out", "--from", "0.1") == 0
+    out, err = capsys.readouterr()
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {Path(line).name for line in out.splitlines()} == names
+    assert {"orbit-disk.png", "orbit-ring.csv", "timebase-forces.png", "timebase-drive.csv"} <= names
+    assert not any(name.startswith("bode") for name in names)
+    assert "bode-disk: left out: speed must be that of a run-up" in err
+    table = np.genfromtxt(tmp_path / "out/orbit-disk.csv", delimiter=",", skip_header=1)
+    assert table[0, 0] >= 0.1
+    assert rig_plot(SESSION, "-o", tmp_path / "few", "--only", "orbit", "--svg", "--parquet") == 0
+    assert {path.name for path in (tmp_path / "few").iterdir()} == {
+        f"orbit-{pair}.{suffix}" for pair in ("disk", "ring") for suffix in ("svg", "parquet")
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "orbti"], "rig: --only must be kinds of plots, such as orbit (10 in all); received 'orbti'\n"),
+        (["--only", "bode"], "rig: speed must be that of a run-up or a coast-down, which changes by a tenth; received"),
+        (["--from", "5"], "rig: --from and --to must be within 0 to 0.5998 s; received 5.0 to None\n"),
+        (["--onyl", "orbit"], "rig: option must be one of `rig plot -h`, such as --only"),
+    ],
+)
+def test_wrong_options_of_the_command_are_one_line(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert rig_plot(SESSION, "-o", tmp_path / "out", *arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
