@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import sys
 from functools import partial
 from typing import Annotated, Any, NoReturn
@@ -17,6 +18,7 @@ from rig.base.errors import (
     describe_missing_package,
     is_full_missing,
 )
+from rig.base.text import printable
 from rig.cli.command import Group, load_command, make_command, make_group, usage_error
 from rig.cli.output import provenance
 from rig.cli.output.tables import echo
@@ -122,6 +124,14 @@ def rig() -> Group:
     return group
 
 
+_SHORTAGES = {
+    "little memory": r"MemoryError|failed to map segment|[Cc]annot allocate memory|without (setting an )?exception",
+    "few threads": r"start new thread|spawn thread|Resource temporarily unavailable",
+    "few open files": "Too many open files",
+}
+"""What the system may lack, and how errors of Python and of libraries name it."""
+
+
 def _load(name: str) -> Any:
     if name not in GROUPS:
         if name in SUMMARIES and name not in _MODULES:
@@ -181,9 +191,23 @@ def start(arguments: list[str] | None = None) -> None:
             _fail(str(InputError("file name", "one that the system accepts", error.filename)))
         # A full disk or a refusal by the file system is not a program error.
         _fail(f"{error.filename or 'the system'}: {error.strerror or error}", status=1)
+    except BaseException as error:  # a library written in Rust may raise what is no Exception
+        if (shortage := describe_shortage(error)) is None:
+            raise
+        _fail(shortage, status=1)
     if code == _INTERRUPTED:
         print("rig: interrupted", file=sys.stderr)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def describe_shortage(error: BaseException | None) -> str | None:
+    """Return a line about memory, threads or files that the system did not grant; None for any other error."""
+    while error is not None:
+        for what, sign in _SHORTAGES.items():
+            if re.search(sign, f"{type(error).__name__}: {error}"):
+                return f"the system has too {what} for this command ({printable(str(error), 200) or 'out of memory'})"
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def _fail(message: str, *, status: int = 2) -> NoReturn:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -121,3 +122,34 @@ def test_a_quoted_number_is_refused() -> None:
     assert parse_scene({"duration_s": 1}).duration_s == 1.0
     with pytest.raises(InputError, match="duration_s must be a number; received '1'"):
         parse_scene({"duration_s": "1"})
+
+
+@pytest.mark.parametrize(
+    ("error", "what"),
+    [
+        (MemoryError(), "little memory"), (RuntimeError("can't start new thread"), "few threads"),
+        (ImportError("libarrow.so: failed to map segment from shared object"), "little memory"),
+        (OSError(24, "Too many open files"), "Too many open files"),
+    ],
+)  # fmt: skip
+def test_a_shortage_of_the_system_is_one_line(
+    error: Exception, what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(*_: object, **__: object) -> None:
+        try:
+            raise error
+        except Exception:
+            if not isinstance(error, OSError):
+                raise AttributeError("no attribute 'inner'")  # noqa: B904 - what a library makes of it
+            raise
+
+    monkeypatch.setattr("rig.cli.app.rig", lambda: SimpleNamespace(main=run))
+    with pytest.raises(SystemExit) as ended:
+        start(["params"])
+    printed = capsys.readouterr().err
+    assert ended.value.code == 1
+    assert what in printed
+    assert printed.count("\n") == 1
+    monkeypatch.setattr("rig.cli.app.rig", lambda: SimpleNamespace(main=lambda *_, **__: {}["x"]))
+    with pytest.raises(KeyError):  # an error of the program keeps its traceback
+        start(["params"])

@@ -20,6 +20,8 @@ PATIENCE_S = 20.0
 _BLOCKED_S = 2.0
 """Longest wait of recovered messages for a link whose other side does not read [s]. Then the link is closed: our own
 client reconnects and requests them again, and a malicious one blocks no longer."""
+_THREADS = 24
+"""Threads that a session of zenoh starts, at most."""
 
 
 def locator(host: str, port: int, *, tls: bool = False) -> str:
@@ -53,6 +55,21 @@ def build_config(**settings: Any) -> Any:
     return config
 
 
+def _check_threads() -> None:
+    """Raise a RuntimeError if zenoh could not start its threads; it would abort the process.
+
+    Raises:
+        RuntimeError: The system does not grant the threads.
+    """
+    end, threads = threading.Event(), list[threading.Thread]()
+    try:
+        for _ in range(_THREADS):
+            threads.append(threading.Thread(target=end.wait, daemon=True))
+            threads[-1].start()
+    finally:
+        end.set()
+
+
 class Session:
     """A zenoh session with its receiving threads, which is always closed.
 
@@ -66,6 +83,7 @@ class Session:
         # A receiving thread blocks while it sends a recovery to a stalled link, or fills the channel of a slow
         # callback; the default of two threads would leave none for the rest. Read at the first session of a process.
         os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
+        _check_threads()
         self.session = zenoh.open(config)
         self._threads: list[threading.Thread] = []
         self._closing = threading.Lock()
