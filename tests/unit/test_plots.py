@@ -378,18 +378,18 @@ def test_the_command_draws_each_pair_and_group(
 ) -> None:
     few = {name: KINDS[name] for name in ("orbit", "timebase", "bode")}
     monkeypatch.setattr("replays.plots.methods.KINDS", few)
-    assert rig_plot(SESSION, "-o", tmp_path / "out", "--from", "0.1") == 0
+    assert rig_plot(SESSION, "-o", tmp_path / "out", "--from", "0.1", "--svg") == 0
     out, err = capsys.readouterr()
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {Path(line).name for line in out.splitlines()} == names
-    assert {"orbit-disk.png", "orbit-ring.csv", "timebase-forces.png", "timebase-drive.csv"} <= names
+    assert {"orbit-disk.svg", "orbit-ring.csv", "timebase-forces.svg", "timebase-drive.csv"} <= names
     assert not any(name.startswith("bode") for name in names)
     assert "bode-disk: left out: speed must be that of a run-up" in err
     table = np.genfromtxt(tmp_path / "out/orbit-disk.csv", delimiter=",", skip_header=1)
     assert table[0, 0] >= 0.1
-    assert rig_plot(SESSION, "-o", tmp_path / "few", "--only", "orbit", "--svg", "--parquet") == 0
+    assert rig_plot(SESSION, "-o", tmp_path / "few", "--only", "orbit", "--parquet") == 0
     assert {path.name for path in (tmp_path / "few").iterdir()} == {
-        f"orbit-{pair}.{suffix}" for pair in ("disk", "ring") for suffix in ("svg", "parquet")
+        f"orbit-{pair}.{suffix}" for pair in ("disk", "ring") for suffix in ("png", "parquet")
     }
 
 
@@ -408,3 +408,40 @@ def test_wrong_options_of_the_command_are_one_line(
     assert rig_plot(SESSION, "-o", tmp_path / "out", *arguments) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_interrupting_the_command_keeps_the_pictures_that_are_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(_: Any) -> Plot:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("replays.plots.methods.KINDS", {"orbit": KINDS["orbit"], "trend": interrupt})
+    assert rig_plot(SESSION, "-o", tmp_path) == 130
+    assert capsys.readouterr().err.endswith("rig: interrupted\n")
+    assert {path.suffix for path in tmp_path.iterdir()} == {".png", ".csv"}
+
+
+def test_samples_of_a_client_have_the_same_plots() -> None:
+    from drivers.sources import samples as client
+
+    ours = build_whirl(0.3, 0.1, duration_s=1.0)
+    theirs = client.Samples(0, 0, RATE_HZ, 1e6, ours.names, ours.units, ours.values)
+    assert theirs.plot.orbit().table.values == pytest.approx(ours.plot.orbit().table.values, abs=1e-9)
+
+
+def test_an_imported_recording_is_drawn(tmp_path: Path) -> None:
+    from rig.cli.main import main
+
+    ours = build_whirl(0.3, 0.1, duration_s=1.0)
+    rows = np.column_stack([ours.times_s, ours.values])
+    heading = '"time [s]","disk_x [mm]","disk_y [mm]","keyphasor [1]"'
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=heading, comments="", fmt="%.9g")
+    for arguments in (["--template", "m.toml"], ["-m", "m.toml", "-o", "log.mcap"]):
+        given = [str(tmp_path / each) if "." in each else each for each in arguments]
+        with pytest.raises(SystemExit) as end:
+            main(["import", str(tmp_path / "log.csv"), *given])
+        assert end.value.code == 0
+    table = Recording.open(tmp_path / "log.mcap").plot.orbit(components="1X").table
+    assert np.ptp(table["x 1X"]) / 2.0 == pytest.approx(0.4, rel=0.01)
+    assert np.ptp(table["y 1X"]) / 2.0 == pytest.approx(0.2, rel=0.01)
