@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -328,13 +329,19 @@ def descendants(pid: int) -> list[Any]:
 
 
 def test_ctrl_c_ends_all_processes_and_reports_finished_cases(tmp_path: Path) -> None:
+    import psutil
+
     (tmp_path / "long.campaign.toml").write_text(SLOW_CAMPAIGN, encoding="utf-8")
     (tmp_path / "test_a.py").write_text("def test_a(measure):\n    measure('a', 1, 'mm', '<=', 2)\n", encoding="utf-8")
     arguments = ("campaign", "test_a.py", "long.campaign.toml", "-j", "2", "-o", "out")
     with processes.start_rig(*arguments, cwd=tmp_path, start_new_session=True) as child:
 
         def devices() -> int:
-            return sum("time.sleep" in " ".join(each.cmdline()) for each in descendants(child.pid))
+            lines = []
+            for each in descendants(child.pid):
+                with suppress(psutil.Error):  # it has just ended
+                    lines.append(" ".join(each.cmdline()))
+            return sum("time.sleep" in line for line in lines)
 
         waiting.until(
             lambda: devices() >= 4, timeout_s=processes.COMPILE_S, every_s=0.1
