@@ -9,6 +9,8 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -315,6 +317,23 @@ def test_a_link_ends_when_its_certificate_expires(folders: Path, tmp_path: Path)
         pytest.fail("not connected while the certificate was valid")
 
 
+@pytest.mark.parametrize(("closes", "message"), [(False, "does not answer: it is stopped"), (True, "is not a rig")])
+def test_a_server_that_is_no_rig_or_is_stopped_is_named(closes: bool, message: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        if closes:
+
+            def close_all() -> None:
+                with contextlib.suppress(OSError):
+                    while True:
+                        server.accept()[0].close()
+
+            threading.Thread(target=close_all, daemon=True).start()
+        endpoint = f"127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(NoReplyError, match=f"^{endpoint} listens, but .*{message}"):
+            ZenohClient(endpoint, wait_s=0.2)
+        server.shutdown(socket.SHUT_RDWR)
+
+
 def test_clients_report_the_reason_of_a_refusal(folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     with ZenohServer(plain, exposed=Exposure(exposed, read_holder(folders / "server", server=True))) as server:
@@ -331,15 +350,15 @@ def test_clients_report_the_reason_of_a_refusal(folders: Path) -> None:
             with pytest.raises(NoReplyError, match=rf"^the rig at {exposed} does not answer rig/parameters$"):
                 viewer.request("rig/parameters", timeout_s=0.2)
         for endpoint, tls, message in (
-            (exposed, None, "without a certificate: an exposed rig needs --tls"),
+            (exposed, None, "refuses this client without a certificate: an exposed rig needs --tls"),
             (
                 exposed,
                 folders / "others" / "viewer",
-                r"as viewer, by the keys in .*: .*\(keys of another rig",
+                r"refuses this client as viewer, by the keys in .*: .*\(keys of another rig",
             ),
-            (plain, folders / "viewer", "as viewer, .*: no TLS is spoken there"),
+            (plain, folders / "viewer", "refuses this client as viewer, .*: no TLS is spoken there"),
         ):
-            with pytest.raises(NoReplyError, match=rf"^{endpoint} listens, but refuses this client {message}"):
+            with pytest.raises(NoReplyError, match=rf"^{endpoint} listens, but {message}"):
                 ZenohClient(endpoint, wait_s=0.2, tls=tls)
     with pytest.raises(NoReplyError, match=f"^no rig answers at {exposed}"):
         ZenohClient(exposed, wait_s=0.2, tls=folders / "viewer")

@@ -7,6 +7,7 @@ lossless client detects missed messages by their numbers, and fetches them from 
 from __future__ import annotations
 
 import socket
+import ssl
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -247,6 +248,21 @@ class ZenohServer(Closing):
         self._session.close()
 
 
+def _explain_silence(link: socket.socket) -> str:
+    """Return why a server refuses a client without certificates: it answers TLS, nothing, or something else."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        context.wrap_socket(link).close()
+    except TimeoutError:
+        return "does not answer: it is stopped (Ctrl-Z, a debugger), or the computer is overloaded"
+    except (ssl.SSLEOFError, ConnectionError):
+        return "refuses this client: it has too many links, or is not a rig"
+    except ssl.SSLError:
+        pass  # a server with certificates refuses this one
+    return "refuses this client without a certificate: an exposed rig needs --tls FOLDER"
+
+
 def _reply(query: Any, key: str, payload: bytes) -> None:
     with query:
         query.reply(key, payload, encoding="application/json")
@@ -334,17 +350,17 @@ class ZenohClient(Closing):
         """Return the error for a failed connection: no rig listens, or it refuses this client."""
         try:
             if self._holder is None:
-                socket.create_connection((self._host, self._port), timeout=1.0).close()
-                explanation = (
-                    "without a certificate: an exposed rig needs --tls FOLDER; otherwise it is not a rig, or it hangs"
-                )
+                with socket.create_connection((self._host, self._port), timeout=1.0) as link:
+                    explanation = _explain_silence(link)
             elif (rejection := self._holder.find_rejection(self._host, self._port)) is not None:
-                explanation = f"as {self._holder.name}, by the keys in {self._holder.folder}: {rejection}"
+                explanation = (
+                    f"refuses this client as {self._holder.name}, by the keys in {self._holder.folder}: {rejection}"
+                )
             else:
-                explanation = "although the certificates are valid: it has too many links, or hangs"
+                explanation = "refuses this client although the certificates are valid: it has too many links, or hangs"
         except OSError:
             return self._no_reply_error()
-        return NoReplyError(f"{self.endpoint} listens, but refuses this client {explanation}")
+        return NoReplyError(f"{self.endpoint} listens, but {explanation}")
 
     def _no_reply_error(self) -> NoReplyError:
         if self._holder is not None and self._holder.expires <= datetime.now(UTC):
