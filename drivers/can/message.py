@@ -191,6 +191,11 @@ class CanMessage:
                 values[signal.name] = value
         return values
 
+    def is_known(self, raw: Mapping[str, int]) -> bool:
+        """Return whether each named value is known here: a rig of another version may send others."""
+        choices = {signal.name: signal.choices for signal in self.signals if signal.choices}
+        return all(value in choices.get(name, (value,)) for name, value in raw.items())
+
 
 @dataclass(frozen=True, slots=True)
 class MessageTable:

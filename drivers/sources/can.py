@@ -317,6 +317,8 @@ class CanSource:
         if row is None or len(data) != row.length:
             return None
         raw, state = row.decode(data), None
+        if not row.is_known(raw):
+            return None
         if row.name == "Sync":
             self._new_sync = raw["index"]
         elif row.name == "Clock":

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import secrets
 import stat
 import tempfile
@@ -46,22 +47,38 @@ def open_file(path: Path) -> BufferedReader:
     return open(path, "rb", opener=opener)
 
 
-def check_inflated(blocks: Iterable[bytes], file_bytes: int) -> None:
+def is_file(path: Path) -> bool:
+    """Return whether a path is a regular file; False also for a name that the system does not accept."""
+    with suppress(OSError):
+        return path.is_file()
+    return False
+
+
+def find_data_limit(file_bytes: int) -> int:
+    """Return the most data that a compressed file of some size may hold [bytes]."""
+    return max(_MAX_INFLATED, _MAX_RATIO * file_bytes)
+
+
+def check_inflated(blocks: Iterable[bytes], file_bytes: int, refused: re.Pattern[bytes] | None = None) -> None:
     """Refuse zlib data that would fill the memory: above 256 MB and above 100 times the size of the file.
 
     Args:
         blocks: All compressed blocks of a file; damaged ones are left to its reader.
         file_bytes: Size of the file [bytes].
+        refused: At most 16 bytes that must not be in the data.
 
     Raises:
-        InputError: The data are larger; not more than that is decompressed.
+        InputError: The data are larger, of which not more is decompressed, or contain what is refused.
     """
-    left = max(_MAX_INFLATED, _MAX_RATIO * file_bytes)
+    left, tail = find_data_limit(file_bytes), b""
     for block in blocks:
         inflate = zlib.decompressobj()
         with suppress(zlib.error):
             while left > 0 and (piece := inflate.decompress(block, 1 << 20)):
-                left, block = left - len(piece), inflate.unconsumed_tail
+                left, block, joined = left - len(piece), inflate.unconsumed_tail, tail + piece
+                if refused is not None and refused.search(joined):
+                    raise InputError("file", "an intact one", Words("data with a block of size 0"))
+                tail = joined[-16:]
         if left <= 0:
             must = f"one with at most {_MAX_RATIO} times its size of data, or {_MAX_INFLATED >> 20} MB"
             raise InputError("file", must, Words("a file with more compressed data"))

@@ -24,6 +24,7 @@ from pydantic import (
 
 from rig.base.checks import check, read_toml
 from rig.base.errors import InputError, UnknownNameError, such_as
+from rig.base.files import is_file
 from rig.base.maths.expression import Grammar
 
 SETS = Path(__file__).with_name("sets")
@@ -217,7 +218,7 @@ def _load(name: Any, field: str, loading: tuple[str, ...]) -> ParameterSet:
     if isinstance(name, str) and name in _own_names():
         return _own_set(name)
     path = Path(name) if isinstance(name, str) else None
-    if path is None or path.suffix != ".toml" or not path.is_file():
+    if path is None or path.suffix != ".toml" or not is_file(path):
         sets = f"one of {', '.join(set_names())}, or the path of an existing .toml file"
         raise InputError(field, f"the set that the file changes, {sets}" if name is None else sets, name)
     place = str(path.resolve())

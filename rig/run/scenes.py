@@ -12,6 +12,7 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from rig.base.checks import Written, check, get_table, parse_toml, read_toml
 from rig.base.errors import InputError, Words, such_as
+from rig.base.files import is_file
 from rig.channels.channel_file import check_table, read_channels
 from rig.channels.faults import Setting
 from rig.channels.formula import Formulas
@@ -276,9 +277,9 @@ def scene_path(name_or_path: str | Path) -> Path:
     if not isinstance(name_or_path, str | Path):
         raise InputError("scene", "a name, or the path of a .toml file", name_or_path)
     path = SCENES / f"{name_or_path}.toml"
-    if not path.is_file():
+    if not is_file(path):
         path = Path(name_or_path)
-        if path.suffix != ".toml" or not path.is_file():
+        if path.suffix != ".toml" or not is_file(path):
             raise InputError(
                 "scene",
                 f"one of {', '.join(scene_names())}, or the path of a .toml file that exists",

@@ -4,15 +4,57 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import resource
+import signal
 import time
 import traceback
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from rig.base.errors import DiskError, InputError
 
-MAX_INPUT_S = 20.0
+MAX_INPUT_S = 120.0
+"""Longest wall time of an input [s], long enough for a loaded computer."""
+MAX_CPU_S = 2.0
+"""Longest processor time of an input [s], by which a loaded computer is not a hang."""
+MAX_GROWTH_MB = 500.0
+"""Largest growth of the memory by an input [MB]."""
+
+
+class HangError(BaseException):
+    """An input takes too long; not an Exception, as those of libraries are translated."""
+
+
+@contextlib.contextmanager
+def limit_processor_time(limit_s: float) -> Iterator[None]:
+    """Raise HangError in the main thread after some processor time of the process [s]."""
+
+    def end(*_: object) -> None:
+        raise HangError(f"more than {limit_s:g} s of processor time")
+
+    before = signal.signal(signal.SIGPROF, end)
+    signal.setitimer(signal.ITIMER_PROF, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
+
+
+def memory_mb(name: str) -> float:
+    """Return a size of this process's memory, such as VmRSS or its peak VmHWM [MB]; 0 if the system does not tell."""
+    with contextlib.suppress(OSError):
+        if found := re.search(rf"{name}:\s+(\d+) kB", Path("/proc/self/status").read_text()):
+            return int(found[1]) / 1024
+    return 0.0
+
+
+def reset_peak() -> None:
+    """Set the peak of the memory to its present size, where the system can."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def input_count(default: int) -> int:
@@ -25,7 +67,30 @@ class InputTally:
 
     def __init__(self) -> None:
         self.accepted = self.refused = 0
+        self.fresh, self.peak_mb = False, 0.0
         self.faults: dict[str, Any] = {}
+
+    @contextlib.contextmanager
+    def attempt_within_limits(self, what: object) -> Iterator[None]:
+        """Try one input as `attempt`, also with limits of its processor time and memory."""
+        reset_peak()
+        start_mb, begin_s = memory_mb("VmHWM"), time.process_time()
+        try:
+            with limit_processor_time(MAX_CPU_S), self.attempt(what):
+                yield
+        except HangError as error:
+            frames = traceback.extract_tb(error.__traceback__)
+            places = [f"{frame.filename.rsplit('/', 1)[-1]}:{frame.lineno}" for frame in frames[:-6:-1]]
+            self.faults.setdefault(f"hang at {' < '.join(places)}", what)
+        else:
+            if time.process_time() - begin_s > MAX_CPU_S:
+                self.faults.setdefault("hang", what)
+        peak_mb = memory_mb("VmHWM")
+        self.peak_mb = max(self.peak_mb, peak_mb)
+        if peak_mb - start_mb > MAX_GROWTH_MB:
+            self.faults.setdefault(
+                f"memory grows by more than {MAX_GROWTH_MB:.0f} MB", (round(peak_mb - start_mb), what)
+            )
 
     @contextlib.contextmanager
     def attempt(self, what: object, *also: type[Exception]) -> Iterator[None]:

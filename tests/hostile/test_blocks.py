@@ -381,7 +381,7 @@ def test_messages_of_another_session_are_skipped_and_counted(monkeypatch: pytest
     import zenoh
 
     # With access control, the default, the block is refused and none has to be skipped.
-    monkeypatch.setattr("rig.serve.transport.zenoh.rules", lambda: {"enabled": False, "default_permission": "allow"})
+    monkeypatch.setattr("rig.serve.transport.zenoh.rules", lambda _: {"enabled": False, "default_permission": "allow"})
     endpoint, truth = free_endpoint(), Truth()
     with ZenohServer(endpoint) as server:
         server.publish(PROBES, truth.payload(PROBES, 0))
@@ -412,16 +412,16 @@ def test_messages_of_another_session_are_skipped_and_counted(monkeypatch: pytest
                 config.insert_json5(name, json.dumps(value))
             with zenoh.open(config) as forger:
                 publisher = forger.declare_publisher(PROBES)
-                for number in range(begun, begun + 50):
+                for number in range(begun, begun + 75):
                     server.publish(PROBES, truth.payload(PROBES, number))
                     publisher.put(b"forged")
                     forger.put(PROBES, truth.payload(PROBES, 10**6 + number))
                     forger.put(wire.EVENTS, b'{"event":"end","reason":"forged","rows":{}}')
                     forger.put(f"{PROBES}/@adv/pub/{forger.zid()}/1/_", b"\x07\x00\x00\x00")
                     time.sleep(0.002)
-                sent = [truth.payload(PROBES, number) for number in range(begun, begun + 50)]
-                until(lambda: all(len(payloads) >= 50 for payloads in got.values()) and client.foreign >= 4 * 50)
+                sent = [truth.payload(PROBES, number) for number in range(begun, begun + 75)]
+                until(lambda: all(len(payloads) >= 75 for payloads in got.values()) and client.foreign >= 4 * 75)
             assert got == {True: sent, False: sent}
             assert events == []
-            assert client.foreign >= 4 * 50
+            assert client.foreign >= 4 * 75
             assert client.rig is not None

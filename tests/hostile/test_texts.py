@@ -7,12 +7,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import gc
-import io
 import json
-import logging
-import re
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +18,7 @@ import pytest
 
 import rig.cli
 from recorder.reader import Recording
-from replays.recordings.formats.conversion import convert, write_recording
+from replays.recordings.formats.conversion import convert
 from replays.recordings.formats.exporting.export import export
 from replays.recordings.formats.exporting.selection import select
 from replays.recordings.formats.guessing.template import example
@@ -38,37 +33,8 @@ from rig.cli.output import tables
 from rig.physics.parameters import SETS, load_parameters
 from rig.run.scenes import SCENES, load_scene, parse_scene, read_value, scene_document, scene_names
 from tests.hostile import InputTally, check_tallies, input_count
-from tests.hostile.files import Layout, Rng, spoil_bytes, spoil_document, write_file
-
-PIECES = (
-    "9" * 5000, "0x" + "f" * 5000, "1e400", "nan", "-inf", "2" * 30, "[" * 3000, "{a=" * 500, '"""', "true", "-1",
-    "0", "1e-300", '"[/]"', '"\\u001b[2J"', "[]", "{}", "1979-05-27", "'x'", "a." * 300 + "a = 1\n", "[[drive]]\n",
-    "[set]\n",    '"' + "x" * 10_000 + '"', "\x00", "=", "\n",
-)  # fmt: skip
-
-
-def spoil_toml(text: str, rng: Rng) -> bytes:
-    """Return TOML with other values, moved lines, inserted pieces or other bytes."""
-    for _ in range(int(rng.integers(1, 4))):
-        lines = text.split("\n")
-        at = int(rng.integers(0, len(lines)))
-        piece = PIECES[int(rng.integers(0, len(PIECES)))]
-        match rng.integers(0, 6):
-            case 0:
-                lines[at] = re.sub(r"=.*", lambda _, piece=piece: f"= {piece}", lines[at], count=1)
-            case 1:
-                del lines[at]
-            case 2:
-                lines.insert(int(rng.integers(0, len(lines))), lines[at])
-            case 3:
-                lines.insert(at, f"x{rng.integers(0, 9)} = {piece}")
-            case 4:
-                return spoil_bytes(text.encode() or b"x", rng)
-            case _:
-                place = int(rng.integers(0, len(lines[at]) + 1))
-                lines[at] = lines[at][:place] + piece + lines[at][place:]
-        text = "\n".join(lines)
-    return text.encode()
+from tests.hostile.files import Layout, spoil_document, write_file
+from tests.hostile.interfaces import spoil_toml
 
 
 def test_any_toml_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
@@ -150,89 +116,7 @@ def test_a_long_dotted_key_takes_no_time(tmp_path: Path) -> None:
         load_scene(tmp_path / "y.toml")
 
 
-RATE_HZ = 1000.0
 X = "[channels]\ndisk_x = { source = 'x', unit = 'mm' }\n"
-
-
-def make_logs(folder: Path) -> dict[str, bytes]:
-    """Return a small log of each format, by suffix."""
-    import nptdms
-    import pyarrow
-    import pyuff
-    import soundfile
-    from asammdf import MDF, Signal
-    from pyarrow import parquet
-
-    t = np.arange(200) / RATE_HZ
-    x = np.round(np.sin(100 * t), 4)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        mdf = MDF(version="4.10")
-        mdf.append([Signal(samples=x, timestamps=t, name="x", unit="mm")], common_timebase=True)
-        mdf.save(folder / "a.mf4", overwrite=True)
-        mdf.close()
-    with nptdms.TdmsWriter(folder / "a.tdms") as writer:
-        writer.write_segment([nptdms.ChannelObject("g", "x", x, {"wf_increment": 1e-3, "unit_string": "mm"})])
-    pyuff.UFF(str(folder / "a.uff")).write_sets(pyuff.prepare_58(
-        binary=1, func_type=1, rsp_node=1, rsp_dir=1, ref_node=1, ref_dir=1, data=x, x=t, id1="x",
-        abscissa_spacing=1, abscissa_min=0.0, abscissa_inc=1e-3, abscissa_spec_data_type=17,
-        ordinate_spec_data_type=8, orddenom_spec_data_type=0, num_pts=len(t), ord_data_type=4, z_axis_value=0.0,
-        z_axis_spec_data_type=0, ordinate_axis_units_lab="mm",
-    ), "add")  # fmt: skip
-    table = pyarrow.table({"time": t, "x": x})
-    parquet.write_table(table, folder / "a.parquet")
-    soundfile.write(folder / "a.wav", x, 1000, subtype="PCM_16")
-    column = {"name": "x", "unit": "mm", "label": "l", "full_scale": 2.0, "offset_exported": 0.5}
-    beside = {"start": "2024-01-01T00:00:00+00:00", "tables": [{"first_s": 0.0, "columns": [column]}]}
-    (folder / "a.wav.json").write_text(json.dumps(beside))
-    lines = [f"{time:.4f},{value:.4f}" for time, value in zip(t, x, strict=True)]
-    (folder / "a.csv").write_text("\n".join(["time,x [mm]", *lines]))
-    head = (
-        "LabVIEW Measurement\t\nSeparator\tTab\nDecimal_Separator\t.\nX_Columns\tOne\nDate\t2024/01/01\n"
-        "Time\t10:00:00\n"
-        "***End_of_Header***\t\nChannels\t1\nY_Unit_Label\tmm\nDelta_X\t0.001\n***End_of_Header***\t\nX_Value\tx\tComment\n"
-    )
-    (folder / "a.lvm").write_text(head + "\n".join(line.replace(",", "\t") for line in lines))
-    return {path.name[1:]: path.read_bytes() for path in folder.iterdir() if path.name.startswith("a.")}
-
-
-# pyuff leaves its file to the garbage collector, and asammdf files that it could not open.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_foreign_logs_are_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "whole").mkdir()
-    whole = make_logs(tmp_path / "whole")
-    (tmp_path / "m.toml").write_text(X)
-    mapping = load_mapping(tmp_path / "m.toml")
-    rng = np.random.default_rng([6, input_count(80)])
-    tallies = {suffix: InputTally() for suffix in whole}
-    logging.disable(logging.CRITICAL)
-    for suffix in whole:  # the unchanged file is accepted
-        if not suffix.endswith(".json"):
-            convert([tmp_path / "whole" / f"a{suffix}"], mapping)
-    for number in range(input_count(80)):
-        suffix = list(whole)[number % len(whole)]
-        data = whole[suffix]
-        for _ in range(int(rng.integers(1, 3))):
-            data = spoil_bytes(data or b"x", rng)
-        folder = tmp_path / "spoilt"
-        folder.mkdir(exist_ok=True)
-        (folder / "a.wav").write_bytes(whole[".wav"])
-        (folder / "a.wav.json").write_bytes(whole[".wav.json"])
-        (folder / f"a{suffix}").write_bytes(data)
-        file = folder / f"a{suffix.removesuffix('.json')}"
-        with tallies[suffix].attempt((suffix, number)), contextlib.redirect_stderr(io.StringIO()):
-            for entry in open_source(file, FileOptions()).entries:
-                wanted = replace_source(mapping, entry.name, entry.group)
-                with contextlib.suppress(InputError):
-                    open_source(file, FileOptions()).read(entry)
-            conversion = convert([file], wanted)
-            if number % 4 == 0:
-                write_recording(conversion, tmp_path / "out.mcap", force=True)
-                Recording.open(tmp_path / "out.mcap")
-    logging.disable(logging.NOTSET)
-    gc.collect()  # unclosed files are allowed here
-    check_tallies(tallies)
 
 
 @pytest.mark.parametrize(("method", "rate_hz"), [("linear", 1_000_000), ("polyphase", 1_000_000), ("none", None)])
@@ -244,11 +128,6 @@ def test_two_values_at_far_times_are_not_a_reason_for_a_terabyte(
     (tmp_path / "m.toml").write_text(f'{X}[resample]\nmethod = "{method}"\n{rate}')
     with pytest.raises(InputError, match=r"resample\.rate_hz must be"):
         convert([tmp_path / "x.csv"], load_mapping(tmp_path / "m.toml"))
-
-
-def replace_source(mapping: Any, name: str, group: str) -> Any:
-    one = mapping.channels["disk_x"].model_copy(update={"source": name, "group": group or None})
-    return mapping.model_copy(update={"channels": {"disk_x": one}})
 
 
 NAMES = ("[/]", "[red]", "[bold", "\\[", "\x1b[2J\x1b[31m", "\u202eabc", "a\nrig: forged", "x" * 10_000, ":smile:")

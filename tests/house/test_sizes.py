@@ -22,7 +22,7 @@ SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
     "drivers": 710,
-    "drivers/can": 4535,
+    "drivers/can": 4538,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
@@ -38,17 +38,17 @@ BUDGETS = {
     "replays/estimate": 337,
     "replays/player": 816,
     "replays/plots": 974,
-    "replays/recordings": 10330,
+    "replays/recordings": 10365,
     "replays/report": 491,
-    "replays/score": 4238,
+    "replays/score": 4244,
     "replays/sessions": 73,
     "replays/studies": 8977,
     "rig": 53,
-    "rig/base": 953,
+    "rig/base": 963,
     "rig/channels": 2452,
     "rig/cli": 5422,
-    "rig/physics": 5479,
-    "rig/run": 1843,
+    "rig/physics": 5480,
+    "rig/run": 1844,
     "rig/serve": 3015,
 }
 _NO_CODE = (

@@ -1032,3 +1032,19 @@ def test_a_missing_library_is_named(name: str, module: str, tmp_path: Path, monk
 def test_the_document_in_the_recording_is_json(daq_text: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     conversion, _ = imported(tmp_path, [daq_text[0]], TEXT_MAPPING)
     assert len(json.loads(json.dumps(conversion.document))["files"][0]["sha256"]) == 64
+
+
+@pytest.mark.parametrize("version", ["3.30", "4.10", "4.20"])
+def test_all_versions_of_mdf_are_read(version: str, tmp_path: Path) -> None:
+    from asammdf import MDF, Signal
+
+    t = np.arange(100) / 1000.0
+    kinds = ["u1", "i2", "f4", "f8", "u8", "?"]
+    with MDF(version=version) as mdf:
+        mdf.append([Signal((t > 0.05).astype(kind), t, name=kind, unit="mm") for kind in kinds], common_timebase=True)
+        path = Path(mdf.save(tmp_path / "a.mf4"))
+    source = open_source(path, FileOptions())
+    found = {entry.name: source.read(entry).physical for entry in source.entries}
+    assert list(found) == kinds
+    for values in found.values():
+        np.testing.assert_array_equal(values, t > 0.05)

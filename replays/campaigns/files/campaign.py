@@ -26,7 +26,7 @@ from replays.campaigns.files.line_numbers import find_line, number_lines
 from replays.campaigns.measurement import split_quantity
 from rig.base.checks import Written, check, parse_toml
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.files import build_read_error, open_file
+from rig.base.files import build_read_error, is_file, open_file
 from rig.channels.faults import find_channels, find_group
 from rig.channels.faults.blocks import BlockFault
 from rig.physics.kernels import signals
@@ -337,7 +337,7 @@ def _case(
     if not scene_name:
         raise InputError("scene", "given, here or in [matrix]", None)
     beside = path.parent / scene_name
-    scene_name = str(beside) if scene_name.endswith(".toml") and beside.is_file() else scene_name
+    scene_name = str(beside) if scene_name.endswith(".toml") and is_file(beside) else scene_name
     changes = {**file.set, **{axis.partition(" ")[2]: each for axis, each in values.items() if axis.startswith("set ")}}
     limits = {**file.limits, **{axis[7:]: each for axis, each in values.items() if axis.startswith("limits ")}}
     knobs = {axis[7:]: str(each) for axis, each in values.items() if axis.startswith("device ")}

@@ -225,7 +225,9 @@ def _start_time(log: Log, zero_s: float) -> datetime:
         if start.tzinfo is None:
             remarks.append(f"{start.isoformat()} has no time zone: read as UTC (set time.start to override)")
             start = start.replace(tzinfo=UTC)
-        return datetime.fromtimestamp(start.timestamp() + zero_s, tz=UTC)
+        if 0.0 <= (start_s := start.timestamp() + zero_s) < _EPOCH_S[1]:
+            return datetime.fromtimestamp(start_s, tz=UTC)
+        remarks.append("the start time of the source is not from 1970 to 2100 and is ignored")
     if _EPOCH_S[0] < zero_s < _EPOCH_S[1]:
         remarks.append("times are in the range of seconds since 1970-01-01 and were read as UTC")
         return datetime.fromtimestamp(zero_s, tz=UTC)

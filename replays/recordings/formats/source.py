@@ -100,6 +100,8 @@ DOCUMENTS = ("catalogue.json", "parameters.json", "scene.json")
 """Documents that `rig export` attaches."""
 MAX_RATE_HZ = 1e9
 """Highest sample rate [Hz], given by time stamps in ns."""
+_MIN_RATE_HZ = 1e-6
+"""Lowest sample rate [Hz]: a value in eleven days."""
 _MAX_TIME_S = 1e12
 
 
@@ -227,31 +229,38 @@ def open_source(path: Path, options: FileOptions) -> Source:
         with _translate_errors(path, where):
             signal = source.read(entry)
             _check(signal)
+            _check_count(len(signal.values), entry)
         return signal
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         assert source.pieces is not None
+        rows = 0
         with _translate_errors(path, what):
             for piece in source.pieces(entries):
                 for signal in piece:
                     _check(signal)
+                rows += len(piece[0].values)
                 yield piece
+            _check_count(rows, entries[0])
 
     entries = tuple(
-        entry if entry.rate_hz is None or 0.0 < entry.rate_hz <= MAX_RATE_HZ else replace(entry, rate_hz=None)
+        entry if entry.rate_hz is None or _MIN_RATE_HZ <= entry.rate_hz <= MAX_RATE_HZ else replace(entry, rate_hz=None)
         for entry in source.entries
+        if entry.rows
     )
     distinct = _make_distinct(entries)
-    renamed = [
+    remarks = [
         f"several signals are named {one.name!r}; one is renamed to {new.name!r}"
         for one, new in zip(entries, distinct, strict=True)
         if one.name != new.name
     ]
+    if empty_count := len(source.entries) - len(entries):
+        remarks.append(f"{empty_count} signals without values ignored")
     about = {key: text for key, text in source.about.items() if len(text) <= _MAX_PROPERTY_LENGTH}
     documents = {name: source.about[name] for name in DOCUMENTS if name in source.about} or _read_sidecar(path)
     return replace(
         source, entries=distinct, read=read, pieces=source.pieces and pieces, about=about, documents=documents,
-        remarks=(*source.remarks, *renamed),
+        remarks=(*source.remarks, *remarks),
     )  # fmt: skip
 
 
@@ -287,7 +296,7 @@ def _check(signal: FileSignal) -> None:
     values, times_s = signal.values, signal.times_s
     if values.ndim != 1 or values.dtype.kind not in "iufb":
         raise ValueError(f"values of {values.dtype} in {values.ndim} dimensions")
-    if signal.rate_hz is not None and not 0.0 < signal.rate_hz <= MAX_RATE_HZ:
+    if signal.rate_hz is not None and not _MIN_RATE_HZ <= signal.rate_hz <= MAX_RATE_HZ:
         raise ValueError(f"a rate of {signal.rate_hz} Hz")
     if not (math.isfinite(signal.scale) and signal.scale and math.isfinite(signal.offset)):
         raise ValueError(f"a scale of {signal.scale}, an offset of {signal.offset}")
@@ -295,6 +304,12 @@ def _check(signal: FileSignal) -> None:
         raise ValueError(f"a start time of {signal.first_s} s")
     if times_s is not None and not (times_s.shape == values.shape and bool((np.abs(times_s) <= _MAX_TIME_S).all())):
         raise ValueError(f"time stamps that are not finite numbers up to {_MAX_TIME_S:g} s, one per row")
+
+
+def _check_count(rows: int, entry: Entry) -> None:
+    """Raise ValueError for a signal with fewer values than the file declares."""
+    if rows < entry.rows:
+        raise ValueError(f"{rows} of {entry.rows} values")
 
 
 def _make_distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
+import zlib
 from collections.abc import Iterator
 from io import BufferedReader
 from pathlib import Path
@@ -23,6 +25,8 @@ _BLF_HEAD, _BLF_OBJECT, _BLF_CONTAINER, _ZLIB = (
     struct.Struct("<HH12x"),
     2,
 )
+_ENDLESS = re.compile(rb"LOBJ.{4}\0{4}", re.DOTALL)
+"""Object of size 0, after which python-can would read the same one again and again."""
 
 
 def is_can_log(path: Path) -> bool:
@@ -42,7 +46,7 @@ def _open_reader(path: Path, file: BufferedReader) -> Any:
     import can
 
     if path.suffix.lower() == ".blf":
-        check_inflated(_find_containers(file), path.stat().st_size)
+        check_inflated(_find_containers(file), path.stat().st_size, _ENDLESS)
         file.seek(0)
         return can.BLFReader(file)
     readers: dict[str, Any] = {".log": can.CanutilsLogReader, ".asc": can.ASCReader, ".trc": can.TRCReader}
@@ -50,15 +54,22 @@ def _open_reader(path: Path, file: BufferedReader) -> Any:
 
 
 def _find_containers(file: BufferedReader) -> Iterator[bytes]:
-    """Yield the compressed data of all containers of a BLF file."""
+    """Yield the compressed data of all containers of a BLF file.
+
+    Raises:
+        ValueError: An object is smaller than its header; python-can would take the rest of the file for its data.
+    """
     _, length = _BLF_HEAD.unpack(file.read(_BLF_HEAD.size))
     file.seek(length)
     while len(head := file.read(_BLF_OBJECT.size)) == _BLF_OBJECT.size:
         _, _, _, size, kind = _BLF_OBJECT.unpack(head)
-        data = file.read(max(0, size - _BLF_OBJECT.size))
+        if size < _BLF_OBJECT.size:
+            raise ValueError("object too small")
+        data = file.read(size - _BLF_OBJECT.size)
         file.read(size % 4)
-        if kind == 10 and len(data) > _BLF_CONTAINER.size and _BLF_CONTAINER.unpack_from(data)[0] == _ZLIB:
-            yield data[_BLF_CONTAINER.size :]
+        if kind == 10 and len(data) > _BLF_CONTAINER.size:
+            method, data = _BLF_CONTAINER.unpack_from(data)[0], data[_BLF_CONTAINER.size :]
+            yield data if method == _ZLIB else zlib.compress(data, 0)
 
 
 def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:

@@ -85,8 +85,8 @@ class Session:
     @property
     def trigger_s(self) -> float | None:
         """Time at which the first command took effect, as a trigger of a DAQ [s], or None."""
-        ticks = [event["tick"] for event in self.recording.events if event.get("event") in TRIGGERS]
-        return ticks[0] / TICKS_HZ if ticks else None
+        ticks = [event.get("tick") for event in self.recording.events if event.get("event") in TRIGGERS]
+        return next((tick / TICKS_HZ for tick in ticks if tick is not None), None)
 
     @property
     def wall_s(self) -> float | None:

@@ -21,6 +21,8 @@ from rig.channels.table import default_table
 
 CHECK = "PLEASE CHECK"
 """Mark of a line that cannot be determined from the files."""
+_CONTROL = re.compile(r"[\0-\x08\x0a-\x1f\x7f]")
+"""Characters that TOML forbids in a line."""
 _LABEL = 60
 _TABLES = ("[[align]]", "[keyphasor]", "[hammer]", "[experiment]")
 """Optional tables at the end of a mapping."""
@@ -100,7 +102,7 @@ def _text(sources: Sequence[Source], attached: dict[Path, Attachments], guesses:
         if any(line.startswith(table) for line in lines):
             continue
         lines += ["#", *(f"# {line}" for line in _example_table(table, guesses))]
-    return "\n".join(lines) + "\n"
+    return "".join(_CONTROL.sub("?", line) + "\n" for line in lines)
 
 
 def _time(guesses: Sequence[Guess]) -> list[str]:
@@ -298,5 +300,5 @@ def _key(name: str) -> str:
 
 
 def _quoted(value: str | int) -> str:
-    # A JSON string is a valid TOML basic string.
-    return json.dumps(value, ensure_ascii=False)
+    # A JSON string is a valid TOML basic string, apart from the character 127.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

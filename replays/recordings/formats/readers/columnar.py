@@ -14,6 +14,7 @@ import numpy as np
 from replays.recordings.formats.exporting import export
 from replays.recordings.formats.readers.dialect import parse_heading, time_column
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz
+from rig.base.files import find_data_limit
 
 _PIECE = 1 << 16
 """Rows of a piece."""
@@ -32,6 +33,8 @@ def look_into(path: Path, options: FileOptions) -> Source:
     from pyarrow import parquet
 
     file = parquet.ParquetFile(path, buffer_size=1 << 20)
+    if 8 * file.metadata.num_rows > find_data_limit(path.stat().st_size):
+        raise ValueError(f"{file.metadata.num_rows} rows")
     schema = file.schema_arrow
     headings = [parse_heading(field.name) for field in schema]
     names = [name for name, _ in headings]

@@ -26,7 +26,7 @@ from replays.recordings.formats.source import (
     read_error,
 )
 from rig.base import units
-from rig.base.files import check_inflated, open_file
+from rig.base.files import check_inflated, find_data_limit, open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.history import ExportEvent
@@ -66,6 +66,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     """
     mdf = _open(path)
     with _suppress_output():
+        _check_records(mdf, find_data_limit(path.stat().st_size))
         entries, texts = _entries(mdf)
 
     def read(entry: Entry) -> FileSignal:
@@ -102,7 +103,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 def _documents(mdf: Any) -> dict[str, str]:
     """Return the documents that `rig export` attached."""
     documents = {}
-    for index, attachment in enumerate(getattr(mdf, "attachments", ())):
+    for index, attachment in enumerate(mdf.attachments if str(mdf.version) >= "4" else ()):
         if attachment.file_name in DOCUMENTS:
             content, *_ = mdf.extract_attachment(index=index)
             documents[attachment.file_name] = bytes(content).decode(errors="replace")
@@ -141,6 +142,25 @@ def _open(path: Path) -> Any:
             with suppress(Exception):
                 frame.f_locals["self"].close()
         raise read_error(path, "MDF", error) from None
+
+
+def _check_records(mdf: Any, data_limit: int) -> None:
+    """Refuse channels outside their records, for which asammdf would read other memory, and records that fill it.
+
+    Raises:
+        ValueError: There is such a channel, or the records of a group exceed the limit [bytes].
+    """
+    for group in mdf.groups:
+        about = group.channel_group
+        record_bits = 8 * (about.samples_byte_nr + getattr(about, "invalidation_bytes_nr", 0))
+        if record_bits // 8 * max(1, about.cycles_nr) > data_limit:
+            raise ValueError(f"{about.cycles_nr} records of {record_bits // 8} bytes")
+        for channel in group.channels:
+            # Version 3 has one offset in bits and further bytes, version 4 bytes and bits.
+            fields = (("start_offset", 1), ("additional_byte_offset", 8), ("byte_offset", 8), ("bit_offset", 1))
+            first = sum(bits * getattr(channel, name, 0) for name, bits in fields)
+            if first + channel.bit_count > record_bits:
+                raise ValueError(f"channel {channel.name} outside its record")
 
 
 def _entries(mdf: Any) -> tuple[list[Entry], int]:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _SENSOR_PROPERTIES = re.compile("sens|bias|gain|coupling|range", re.IGNORECASE)
 """Properties of a channel that describe its sensor or amplifier."""
+_MAX_SCALES, _MAX_SUMS = 64, 8
+"""Most scales of a channel, and most that add two others: npTDMS computes each of these anew for each use."""
 _RAW_INPUT = 0xFFFFFFFF
 """Input of the first scale: the raw values."""
 
@@ -50,6 +52,11 @@ def look_into(path: Path, options: FileOptions) -> Source:
     with _suppress_output():
         file = nptdms.TdmsFile.read_metadata(path)
     groups = [(group.name, group.channels()) for group in file.groups()]
+    for each in (file, *file.groups(), *(channel for _, channels in groups for channel in channels)):
+        kinds = [value for key, value in each.properties.items() if key.endswith("_Scale_Type")]
+        count, sums = each.properties.get("NI_Number_Of_Scales", 0), sum(kind in ("Add", "Subtract") for kind in kinds)
+        if count > _MAX_SCALES or sums > _MAX_SUMS:
+            raise ValueError(f"{count} scales, {sums} of them sums")
     starts = [
         channel.properties["wf_start_time"]
         for _, channels in groups
