@@ -446,7 +446,13 @@ def test_a_campaign_runs_on_a_recording_and_on_a_running_rig(folder: Path) -> No
     (folder / "there.campaign.toml").write_text(EXTERNAL_CAMPAIGN, encoding="utf-8")
     with processes.start_rig("run", "stable-run", "--listen", "127.0.0.1:0", "--name", "there-for-a-campaign") as rig:
         processes.read_line(rig, "listening on")
-        _, there = run_campaign(folder, "there.campaign.toml", "--url", "there-for-a-campaign", status=0)
+        arguments = ("there.campaign.toml", "--url", "there-for-a-campaign")
+        try:
+            _, there = run_campaign(folder, *arguments, status=0)
+        except AssertionError as error:  # a busy computer: the verdict is inconclusive, and says so
+            if "the rig was late" not in str(error):
+                raise
+            _, there = run_campaign(folder, *arguments, status=0)
         rig.terminate()
         rig.communicate(timeout=60.0)
     assert [(case["outcome"], case["reason"]) for case in there["cases"]] == [
