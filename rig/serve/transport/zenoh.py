@@ -362,13 +362,14 @@ class ZenohClient(Closing):
             return self._no_reply_error()
         return NoReplyError(f"{self.endpoint} listens, but {explanation}")
 
+    def _expiry_error(self) -> NoReplyError | None:
+        if self._holder is None or self._holder.expires > datetime.now(UTC):
+            return None
+        return NoReplyError(f"the rig at {self.endpoint} refuses the certificate in {self._holder.describe_expiry()}")
+
     def _no_reply_error(self) -> NoReplyError:
-        if self._holder is not None and self._holder.expires <= datetime.now(UTC):
-            return NoReplyError(
-                f"the rig at {self.endpoint} refuses the certificate in {self._holder.describe_expiry()}"
-            )
         start = "start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
-        return NoReplyError(f"no rig answers at {self.endpoint}; {start}")
+        return self._expiry_error() or NoReplyError(f"no rig answers at {self.endpoint}; {start}")
 
     @property
     def connection(self) -> str | None:
@@ -491,7 +492,9 @@ class ZenohClient(Closing):
                 if (text := payload_back.decode(errors="replace")) != "Timeout":
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
             if linked and not linked & self._linked_rigs():
-                raise NoReplyError(f"the link to the rig at {self.endpoint} was lost before the reply to {key}")
+                raise self._expiry_error() or NoReplyError(
+                    f"the link to the rig at {self.endpoint} was lost before the reply to {key}"
+                )
             # Without a rig the reply is empty at once; the rig may be about to start. A denied request looks the same.
             late = (deadline if self._linked_rigs() else restart_deadline).left_s <= _RETRY_S
             denied = not is_allowed(role, Action.ASK, key)
