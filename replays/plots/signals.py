@@ -158,6 +158,16 @@ class Signals:
         pairs = {stem or "x, y": (each["x"], each["y"]) for (stem, _), each in found.items() if len(each) == 2}
         return dict(sorted(pairs.items(), key=lambda pair: not self.is_length(pair[1][0])))
 
+    def require_pairs(self) -> dict[str, tuple[str, str]]:
+        """Return the pairs of probes.
+
+        Raises:
+            InputError: There is none.
+        """
+        if not (pairs := self.pairs):
+            raise InputError("channels", "with a pair of probes, such as disk_x and disk_y", ", ".join(self.names))
+        return pairs
+
     def list_channels(self, names: Sequence[str] | str = ()) -> list[str]:
         """Return channels by their names or those of pairs; without names, the first pair.
 
@@ -166,9 +176,7 @@ class Signals:
         """
         if isinstance(names, str):
             names = [names]
-        pairs = self.pairs
-        if not (names or pairs):
-            raise InputError("channels", "with a pair of probes, such as disk_x and disk_y", ", ".join(self.names))
+        pairs = self.pairs if names else self.require_pairs()
         return [each for name in names or list(pairs)[:1] for each in pairs.get(name, (name,))]
 
     def get_direction_deg(self, name: str) -> float:
@@ -186,9 +194,7 @@ class Signals:
             InputError: There is no pair, or no row of it.
             UnknownNameError: There is no pair of this name.
         """
-        pairs = self.pairs
-        if not pairs:
-            raise InputError("channels", "with a pair of probes, such as disk_x and disk_y", ", ".join(self.names))
+        pairs = self.require_pairs()
         if name is None:
             name = next(iter(pairs))
         if name not in pairs:
@@ -283,15 +289,13 @@ def measure_runout(source: Any, *, orders: int = 1, max_hz: float | None = None,
     """
     signals = read_signals(source, **options)
     edges_s, vectors = signals.require_edges("run-out"), dict[str, np.ndarray]()
-    for name in [name for pair in signals.pairs.values() for name in pair]:
+    for name in [name for pair in signals.require_pairs().values() for name in pair]:
         samples = signals.read(name)
         turns, fitted = fit_orders(samples, samples.values, edges_s, tuple(range(1, orders + 1)))
         slow = np.diff(edges_s)[turns] >= (0.0 if max_hz is None else 1.0 / max_hz)
         if not slow.any():
             raise InputError("max_hz", f"above the speed of a whole revolution of {name}", max_hz)
         vectors[name] = fitted[slow, 1:, 0].mean(axis=0)
-    if not vectors:
-        raise InputError("channels", "with a pair of probes, such as disk_x and disk_y", ", ".join(signals.names))
     return Runout(vectors)
 
 

@@ -6,10 +6,8 @@ written to a new file with a name that cannot be guessed, so that no symbolic li
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
-import re
 import secrets
 import stat
 import tempfile
@@ -26,7 +24,8 @@ from rig.base.text import find_similar
 
 PART_SUFFIX = ".part"
 """Suffix of a file while it is written."""
-_MAX_NAME = 200
+_MAX_NAME = 50
+"""Characters of a file name in that of its draft; a name has at most 255 bytes, a character up to four."""
 _MAX_INFLATED, _MAX_RATIO = 256 << 20, 100
 
 
@@ -59,26 +58,23 @@ def find_data_limit(file_bytes: int) -> int:
     return max(_MAX_INFLATED, _MAX_RATIO * file_bytes)
 
 
-def check_inflated(blocks: Iterable[bytes], file_bytes: int, refused: re.Pattern[bytes] | None = None) -> None:
-    """Refuse zlib data that would fill the memory: above 256 MB and above 100 times the size of the file.
+def inflate(blocks: Iterable[bytes], file_bytes: int) -> Iterator[bytes]:
+    """Yield the data of zlib blocks in pieces of at most 1 MB, unless they would fill the memory.
 
     Args:
         blocks: All compressed blocks of a file; damaged ones are left to its reader.
         file_bytes: Size of the file [bytes].
-        refused: At most 16 bytes that must not be in the data.
 
     Raises:
-        InputError: The data are larger, of which not more is decompressed, or contain what is refused.
+        InputError: The data exceed 256 MB and 100 times the size of the file; not more is decompressed.
     """
-    left, tail = find_data_limit(file_bytes), b""
+    left = find_data_limit(file_bytes)
     for block in blocks:
-        inflate = zlib.decompressobj()
+        decompressor = zlib.decompressobj()
         with suppress(zlib.error):
-            while left > 0 and (piece := inflate.decompress(block, 1 << 20)):
-                left, block, joined = left - len(piece), inflate.unconsumed_tail, tail + piece
-                if refused is not None and refused.search(joined):
-                    raise InputError("file", "an intact one", Words("data with a block of size 0"))
-                tail = joined[-16:]
+            while left > 0 and (piece := decompressor.decompress(block, 1 << 20)):
+                left, block = left - len(piece), decompressor.unconsumed_tail
+                yield piece
         if left <= 0:
             must = f"one with at most {_MAX_RATIO} times its size of data, or {_MAX_INFLATED >> 20} MB"
             raise InputError("file", must, Words("a file with more compressed data"))
@@ -88,7 +84,7 @@ def build_read_error(path: Path, error: OSError) -> InputError:
     """Return the error for an unreadable file, with similar names in its folder, such as an unfinished recording."""
     names: list[str] = []
     if isinstance(error, FileNotFoundError):
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             names = sorted(each.name for each in path.parent.iterdir() if path.suffix in each.name)
     names = [name for name in names if name.startswith(f"{path.stem}.")][:3] or find_similar(path.name, names)
     such = f", such as {', '.join(str(path.with_name(name)) for name in names)}" if names else ""

@@ -129,7 +129,7 @@ _SHORTAGES = {
     "few threads": r"start new thread|spawn thread|Resource temporarily unavailable",
     "few open files": "Too many open files",
 }
-"""What the system may lack, and how errors of Python and of libraries name it."""
+"""Patterns of errors of Python and of libraries, by what the system did not grant."""
 
 
 def _load(name: str) -> Any:

@@ -38,7 +38,7 @@ BUDGETS = {
     "replays/estimate": 337,
     "replays/player": 816,
     "replays/plots": 974,
-    "replays/recordings": 10365,
+    "replays/recordings": 10366,
     "replays/report": 491,
     "replays/score": 4244,
     "replays/sessions": 73,

@@ -15,16 +15,12 @@ import numpy as np
 
 from replays.score.records.recorded import Pieces, Recorded, RecordedTable
 from rig.base.errors import InputError, Words
-from rig.base.files import build_read_error, check_inflated, open_file
+from rig.base.files import build_read_error, inflate, open_file
 from rig.channels.table import ChannelTable
 
 _SUFFIXES = (".log", ".asc", ".blf", ".trc")
-_BLF_HEAD, _BLF_OBJECT, _BLF_CONTAINER, _ZLIB = (
-    struct.Struct("<4sI"),
-    struct.Struct("<4sHHII"),
-    struct.Struct("<HH12x"),
-    2,
-)
+_BLF_HEAD, _BLF_OBJECT = struct.Struct("<4sI"), struct.Struct("<4sHHII")
+_BLF_CONTAINER, _ZLIB = struct.Struct("<HH12x"), 2
 _ENDLESS = re.compile(rb"LOBJ.{4}\0{4}", re.DOTALL)
 """Object of size 0, after which python-can would read the same one again and again."""
 
@@ -46,7 +42,11 @@ def _open_reader(path: Path, file: BufferedReader) -> Any:
     import can
 
     if path.suffix.lower() == ".blf":
-        check_inflated(_find_containers(file), path.stat().st_size, _ENDLESS)
+        tail = b""
+        for piece in inflate(_find_containers(file), path.stat().st_size):
+            if _ENDLESS.search(tail + piece):
+                raise InputError("file", "an intact one", Words("data with a block of size 0"))
+            tail = (tail + piece)[-16:]
         file.seek(0)
         return can.BLFReader(file)
     readers: dict[str, Any] = {".log": can.CanutilsLogReader, ".asc": can.ASCReader, ".trc": can.TRCReader}
@@ -54,7 +54,7 @@ def _open_reader(path: Path, file: BufferedReader) -> Any:
 
 
 def _find_containers(file: BufferedReader) -> Iterator[bytes]:
-    """Yield the compressed data of all containers of a BLF file.
+    """Yield the data of all containers of a BLF file, compressed by zlib.
 
     Raises:
         ValueError: An object is smaller than its header; python-can would take the rest of the file for its data.

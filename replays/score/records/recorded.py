@@ -32,7 +32,6 @@ _STEP_TOLERANCE = 0.2
 _REGULAR_PART, _MAX_ROUNDED = 0.9, 1.1
 """Part of equal steps above which stamps are not rounded to a coarse resolution, and largest deviation of such stamps
 from a line, peak to peak, over their largest step."""
-
 _MAX_SCATTER, _MIN_GAP = 5.0, 3.0
 """The same over the usual step for stamps of which some go back by jitter, and steps over the usual one from which rows
 are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak and steps of 2.5."""

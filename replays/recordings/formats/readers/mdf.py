@@ -26,7 +26,7 @@ from replays.recordings.formats.source import (
     read_error,
 )
 from rig.base import units
-from rig.base.files import check_inflated, find_data_limit, open_file
+from rig.base.files import find_data_limit, inflate, open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.history import ExportEvent
@@ -122,7 +122,8 @@ def _find_compressed_blocks(path: Path) -> Iterator[bytes]:
 
 def _open(path: Path) -> Any:
     asammdf = load_library("MDF", "asammdf")
-    check_inflated(_find_compressed_blocks(path), path.stat().st_size)
+    for _ in inflate(_find_compressed_blocks(path), path.stat().st_size):
+        pass  # refuses too much data before asammdf decompresses it
     file = open_file(path)
     finished = file.read(_HEAD)[-_FLAGS:] == bytes(_FLAGS)
     try:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _SENSOR_PROPERTIES = re.compile("sens|bias|gain|coupling|range", re.IGNORECASE)
 """Properties of a channel that describe its sensor or amplifier."""
 _MAX_SCALES, _MAX_SUMS = 64, 8
-"""Most scales of a channel, and most that add two others: npTDMS computes each of these anew for each use."""
+"""Most scales of a channel, and most that add two others: npTDMS computes each of these for each use."""
 _RAW_INPUT = 0xFFFFFFFF
 """Input of the first scale: the raw values."""
 
