@@ -1,10 +1,10 @@
 """Distribution of tests over workers (`-n`), and fixtures that many tests share.
 
 Tests that read the clock or start processes wait most of their time. Modules marked in this way form two queues, each
-processed by one worker. Tests within a process come first, the few that run an engine last; tests that start real rigs
-follow, when their engine is compiled. A second worker compiles all engines one after another, because two that compile
-at the same time would both compile the shared parts. A third worker runs the tools and other modules that need no
-engine until the default engine is compiled. All other modules follow, the longest first.
+processed by one worker. Tests within a process come first; tests that run an engine or start real rigs follow, when
+that engine is compiled. A second worker compiles all engines one after another, because two that compile at the same
+time would both compile the shared parts. A third worker runs the tools and other modules that need no engine until the
+default engine is compiled. All other modules follow, the longest first.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ WITHOUT_ENGINE = (
     "tests/unit/test_report.py",
     "tests/house/test_sizes.py",
     "tests/house/test_contracts.py",
-)
-"""Modules that compile no engine, 28 s of processor time. Rigs started during this time would also compile theirs."""
-LONG_MODULES = (
     "tests/unit/test_score_track.py",
-    "tests/unit/test_nuisance.py",
     "tests/unit/test_score.py",
+)
+"""Modules that run no engine, for as long as the default engine compiles (75 s of processor time). A rig or a test that
+runs an engine during this time would compile it as well, and take 40 s of processor time for it."""
+LONG_MODULES = (
+    "tests/unit/test_nuisance.py",
     "tests/unit/test_score_faults.py",
     "tests/unit/test_paper.py",
     "tests/unit/test_blind_faults.py",
@@ -73,7 +74,7 @@ LONG_MODULES = (
 )
 """Modules that take more than 8 s and therefore must not start last."""
 _CLOCK = re.compile(r"^pytestmark = .*\bwallclock\b", re.MULTILINE)
-_ENGINE = re.compile(r"^from rig\.simulation import .*\bSimulation\b", re.MULTILINE)
+_ENGINE = re.compile(r"^from rig\.run\.simulation import .*\bSimulation\b", re.MULTILINE)
 
 
 def _module(nodeid: str) -> str:
@@ -84,21 +85,16 @@ def _module(nodeid: str) -> str:
 def _queue(module: str) -> str | None:
     """Return the queue of a module; None if it does not wait."""
     path = ROOT / module
-    if not path.is_file() or _CLOCK.search(path.read_text(encoding="utf-8")) is None:
+    if not path.is_file() or _CLOCK.search(text := path.read_text(encoding="utf-8")) is None:
         return None
-    return "rigs" if module.startswith("tests/system/") else "clock"
-
-
-@cache
-def _runs_engine(module: str) -> bool:
-    return _ENGINE.search((ROOT / module).read_text(encoding="utf-8")) is not None
+    return "rigs" if module.startswith("tests/system/") or _ENGINE.search(text) else "clock"
 
 
 def _place(nodeid: str) -> tuple[int, int]:
     """Return the position of a test: waiting tests, engines, tests without engine, rigs, long tests, all others."""
     module = _module(nodeid)
     if _queue(module) == "clock":
-        return 0, int(_runs_engine(module))
+        return 0, 0
     if module == COMPILING:
         return 1, 0
     if module == TOOLS:
@@ -117,6 +113,8 @@ def pytest_configure(config: pytest.Config) -> None:
     # Only with workers, that is for the whole suite: the programs of `tests/mutants.py` need it off.
     if getattr(config.option, "numprocesses", None):
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        # Workers occupy all cores. A second thread in each would only wait for them: 15 % of the processor time.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # One cache for all processes that tests start. Without it, a program that uses the bus only would keep its machine
     # code elsewhere and compile for another 25 s.
     os.environ.setdefault("NUMBA_CACHE_DIR", str(numba.config.CACHE_DIR))

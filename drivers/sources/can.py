@@ -173,6 +173,7 @@ class CanSource:
         self._sync: int | None = None
         self._new_sync: int | None = None
         """Index of the latest Sync as sent, while Rates is missing."""
+        self._has_no_clock = False
         self._clock_s: int | None = None
         """Simulated time of the latest Clock [s]."""
         self._beat: dict[str, int] | None = None
@@ -222,13 +223,13 @@ class CanSource:
         }
 
     def wait(self) -> None:
-        """Wait for a rig's Rates and Sync.
+        """Wait for a rig's Clock, Rates and Sync; without Clock, a time after a wrap would be too small.
 
         Raises:
             InputError: No rig is on that bus.
         """
         if not self._rates_known.wait(self._wait_s) or self.rates is None:
-            must = f"a bus with a rig on it (no Rates and Sync in {self._wait_s:g} s)"
+            must = f"a bus with a rig on it (no Clock, Rates and Sync in {self._wait_s:g} s)"
             raise InputError("can", must, self._bus.channel_info)
 
     def send(self, identifier: int, data: bytes) -> None:
@@ -325,7 +326,8 @@ class CanSource:
             self._clock_s = raw["seconds"]
             self._new_sync = self._new_sync if self._sync is None else self._sync % _WRAP
         elif row.name == "Rates":
-            self.rates = raw
+            # Clock precedes it in each period; rigs of version 0.1 send none.
+            self._has_no_clock, self.rates = self.rates is not None, raw
         elif row.name == "Heartbeat":
             state = raw["state"]
             self._other_layout = raw["layout"] if raw["layout"] not in (0, self._table.layout) else 0
@@ -346,7 +348,8 @@ class CanSource:
         if self._on_frame is not None and row.name != "Sync":
             self.deliver()
             self._on_frame(row.name, raw)
-        if self._sync is not None and self.rates is not None and self.rates["rate"]:
+        has_clock = self._clock_s is not None or self._has_no_clock
+        if has_clock and self._sync is not None and self.rates is not None and self.rates["rate"]:
             self._rates_known.set()
         return state
 

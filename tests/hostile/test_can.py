@@ -653,6 +653,7 @@ def test_false_frames_do_not_stop_a_daq_and_are_counted() -> None:
                 row = table.by_name[name]
                 rig.send(can.Message(arbitration_id=row.identifier, data=row.encode(**raw), is_extended_id=False))
 
+            say("Clock", seconds=0)
             say("Rates", rate=20_000, fd_step=0, classic_step=20, latency=0)
             say("Sync", index=0, time=0)
             say("Samples_1", index=0)

@@ -29,7 +29,7 @@ import typer
 
 from tests.processes import COMPILE_S, ROOT
 
-pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.wallclock
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = [*PAGES, ROOT / "CONTRIBUTING.md"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import can  # noqa: TID253 - the subject
 import numpy as np
@@ -13,14 +13,16 @@ import pytest
 
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
+from drivers.can.signals import default_messages
 from drivers.daq import Daq
 from drivers.sources.can import CanSource, full_index
 from drivers.sources.can_client import CanClient
 from rig.base import wire
+from rig.base.errors import InputError
 from rig.channels.table import default_table
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.instruments_fake import FakeRig
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
 GROUPS = tuple(default_table().groups)
@@ -67,8 +69,9 @@ def late_rig(time_s: float, *, lockstep: bool = False) -> Iterator[tuple[LateRig
         with Gateway(client, bus, Schedule(), paced=False) as gateway:
             if lockstep:
                 server.publish(wire.STATUS, wire.encode_document({"pace": "lockstep"}))
-                rig.step()
-                until(lambda: gateway.outbox.sent > 50)  # the block, not only the status
+            rig.step()
+            until(lambda: gateway.outbox.sent > 50)  # the block, not only the status
+            if lockstep:
                 yield rig, channel
                 return
             ends = threading.Event()
@@ -88,7 +91,7 @@ def late_rig(time_s: float, *, lockstep: bool = False) -> Iterator[tuple[LateRig
 
 @pytest.mark.parametrize("time_s", INSTANTS_S)
 def test_a_late_client_has_the_time_of_the_rig(time_s: float) -> None:
-    with late_rig(time_s) as (rig, channel), CanClient(f"virtual:{channel}") as client:
+    with late_rig(time_s) as (rig, channel), CanClient(f"virtual:{channel}", wait_s=PATIENCE_S) as client:
         status = wire.decode_document(client.request(wire.STATUS))
         assert time_s - 0.3 <= status["time_s"] <= rig.tick * 1e-6
         reply = wire.decode_document(client.request(wire.command_key("release"), b"{}"))
@@ -98,17 +101,43 @@ def test_a_late_client_has_the_time_of_the_rig(time_s: float) -> None:
 
 @pytest.mark.parametrize("time_s", [80 * 60, 60 * 3600])
 def test_samples_read_late_have_the_time_of_the_rig(time_s: float) -> None:
-    with late_rig(time_s) as (rig, channel), Daq(CanSource(f"virtual:{channel}"), channels=["P_E"]) as daq:
+    with (
+        late_rig(time_s) as (rig, channel),
+        Daq(CanSource(f"virtual:{channel}", wait_s=PATIENCE_S), channels=["P_E"]) as daq,
+    ):
         block = daq.read(10)
         assert time_s <= block.tick * 1e-6 <= rig.tick * 1e-6
 
 
 @pytest.mark.parametrize("time_s", [40 * 60, 60 * 3600])
 def test_a_client_that_joins_between_two_steps_has_the_time_of_the_rig(time_s: float) -> None:
-    with late_rig(time_s, lockstep=True) as (rig, channel), CanClient(f"virtual:{channel}") as client:
+    with (
+        late_rig(time_s, lockstep=True) as (rig, channel),
+        CanClient(f"virtual:{channel}", wait_s=PATIENCE_S) as client,
+    ):
         assert client.source.lockstep
         status = wire.decode_document(client.request(wire.STATUS))
         assert status["time_s"] == pytest.approx(rig.tick * 1e-6)
+
+
+RATES = {"rate": RATE_HZ, "fd_step": 0, "classic_step": 20, "latency": 0}
+
+
+@pytest.mark.parametrize(("name", "raw"), [("Clock", {"seconds": 60 * 3600}), ("Rates", RATES)])
+def test_a_client_that_joins_after_a_clock_waits_for_the_next(name: str, raw: dict[str, int]) -> None:
+    """Rates and Sync alone give the time since the last wrap. A rig of version 0.1 sends no Clock before its Rates."""
+    with closing(CanSource("virtual:after-clock", wait_s=0.0)) as source:
+
+        def take(name: str, **raw: int) -> None:
+            row = default_messages().by_name[name]
+            source.take(row.identifier, row.encode(**raw))
+
+        take("Rates", **RATES)
+        take("Sync", index=60 * 3600 * RATE_HZ % (1 << 32), time=0)
+        with pytest.raises(InputError, match="no Clock, Rates and Sync"):
+            source.wait()
+        take(name, **raw)
+        source.wait()
 
 
 def test_an_index_is_the_nearest_with_its_low_32_bits() -> None:

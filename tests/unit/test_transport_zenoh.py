@@ -503,7 +503,7 @@ def test_close_works_even_if_a_callback_never_returns(monkeypatch: pytest.Monkey
         never.set()
 
 
-def test_a_lossy_subscriber_that_stalls_keeps_the_newest(server: ZenohServer) -> None:
+def test_a_lossy_subscriber_that_stalls_keeps_the_newest() -> None:
     got: list[int] = []
     go = threading.Event()
 
@@ -511,18 +511,17 @@ def test_a_lossy_subscriber_that_stalls_keeps_the_newest(server: ZenohServer) ->
         go.wait(20.0)
         got.append(int(payload))
 
-    with ZenohClient(server.endpoint) as client:
+    # A server that does not wait may drop the newest message itself, where the machine is busy.
+    with ZenohServer(free_endpoint(), wait=True) as server, ZenohClient(server.endpoint) as client:
+        server.answer("rig/status", lambda _: b"")
         client.subscribe("rig/**", take, lossless=False)
         for n in range(5000):
             server.publish("rig/status", str(n).encode())
-        server.answer("rig/scene", lambda _: b"")
-        # The reply comes on the same link: everything before it has arrived.
-        client.request("rig/scene", timeout_s=10.0)
-        time.sleep(0.2)
+        client.settle()  # a reply on the same link: everything before it has arrived
         go.set()
         until(lambda: bool(got) and got[-1] == 4999)
     assert got == sorted(got)
-    assert len(got) < 5000
+    assert len(got) <= 2001  # the first, and a full ring
 
 
 def test_a_callback_that_raises_is_reported_and_does_not_block_the_link(
