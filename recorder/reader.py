@@ -21,6 +21,7 @@ from recorder.files import schemas
 from recorder.files.chunks import Chunk
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.samples import Plottable, Samples, merge_samples
+from rig.base.text import build_html_table
 from rig.base.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, get_schema, sensor_key, truth_key
 from rig.channels.faults.ledger import Declared, sort_blocks
 
@@ -99,6 +100,13 @@ class Recording(Plottable):
             f"Recording({self.path}{more}: scene {self.scene.get('name')}, {span}, {self.end_reason}; "
             f"{', '.join(self.table.groups)})"
         )
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, ", ".join(group.names), f"{group.rate_hz} Hz", self.messages.get(sensor_key(name), 0))
+            for name, group in self.table.groups.items()
+        ]
+        return build_html_table(repr(self), ("group", "channels", "rate", "blocks"), rows)
 
     @property
     def chunks(self) -> tuple[Chunk, ...]:

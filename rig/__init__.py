@@ -15,8 +15,10 @@ rotordynamic plots from samples.
 
 Recordings are opened by `recorder.reader.Recording`, with samples of the same
 type, and written by `replays.recordings.export.write_run`; `rig.connect`, which
-is `drivers.client.connect`, reads and commands a running rig. The commands of
-`rig` use the same objects.
+is `drivers.client.connect`, reads and commands a running rig. `rig.open_session`
+opens one of the recordings that are installed with the rig, and
+`rig.show_progress` shows a progress bar of long work. The commands of `rig` use
+the same objects.
 """
 
 from __future__ import annotations
@@ -37,10 +39,17 @@ if TYPE_CHECKING:
     def connect(url: str = "", **settings: Any) -> Any:
         """Connect to a running rig: `drivers.client.connect`, which must not be imported from here."""
 
+    def open_session(name: str) -> Any:
+        """Open a reference session that is installed with the rig: `replays.sessions.open_session`."""
+
+    def show_progress(text: str = "") -> Any:
+        """Show a progress bar: `rig.cli.output.progress.show_progress`."""
+
 
 __all__ = [
     "InputError", "ParameterSet", "Run", "Samples", "Scene", "Simulation", "UnknownNameError", "connect",
-    "full_spectrum", "load_parameters", "load_scene", "simulate", "synchronous", "waterfall", "whirl_frequency",
+    "full_spectrum", "load_parameters", "load_scene", "open_session", "show_progress", "simulate", "synchronous",
+    "waterfall", "whirl_frequency",
 ]  # fmt: skip
 
 find_our_modules()
@@ -52,7 +61,9 @@ _HOMES = {
     "base.samples": ("Samples",),
     "run.scenes": ("Scene", "load_scene"),
     "run.simulation": ("Simulation",),
+    "cli.output.progress": ("show_progress",),
 }
+_OTHER_PACKAGES = {"connect": "drivers.client", "open_session": "replays.sessions"}
 
 if not TYPE_CHECKING:  # a type checker uses the imports above
 
@@ -60,15 +71,15 @@ if not TYPE_CHECKING:  # a type checker uses the imports above
         # Imported on first use: `rig --help` must not load compiled code.
         from importlib import import_module, metadata
 
-        if name == "connect":
+        if (other := _OTHER_PACKAGES.get(name)) is not None:
             from pathlib import Path
 
             from rig.base.import_paths import PLACE
 
-            client = import_module("drivers.client")
-            if Path(str(client.__file__)).resolve().parent != Path(PLACE, "drivers").resolve():
-                raise ImportError(f"drivers.client must be the rig's own; received {client.__file__}; rename it")
-            return client.connect
+            module = import_module(other)
+            if not Path(str(module.__file__)).resolve().is_relative_to(Path(PLACE, other.partition(".")[0]).resolve()):
+                raise ImportError(f"{other} must be the rig's own; received {module.__file__}; rename it")
+            return getattr(module, name)
         if name == "__version__":
             return metadata.version("rotor-stator-rig")
         home = next((home for home, names in _HOMES.items() if name in names), None)

@@ -10,6 +10,7 @@ import numpy as np
 from recorder.reader import Recording
 from replays.recordings.whirl import WhirlFigures, parameter_si, reactions, whirl_figures
 from rig.base.errors import InputError
+from rig.base.text import build_html_table
 
 PAPER_WHIRL_HZ = 83.7
 """Whirl frequency in the paper's Fig. 14, at 6.2 Hz spin."""
@@ -43,6 +44,11 @@ class Verdict:
     def good(self) -> bool:
         """True if no line failed."""
         return all(row.good is not False for row in self.rows)
+
+    def _repr_html_(self) -> str:
+        words = {None: "", True: "pass", False: "fail"}
+        rows = [(row.quantity, row.measured, row.expected, words[row.good]) for row in self.rows]
+        return build_html_table(self.remark or "Verdict", ("quantity", "measured", "expected", "verdict"), rows)
 
 
 def hammer_time_s(recording: Recording) -> float:

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from replays.sessions.session import FOLDER, SESSIONS, ReferenceSession, make
+from replays.sessions.session import FOLDER, SESSIONS, ReferenceSession, make, open_session
 
-__all__ = ["FOLDER", "SESSIONS", "ReferenceSession", "make"]
+__all__ = ["FOLDER", "SESSIONS", "ReferenceSession", "make", "open_session"]

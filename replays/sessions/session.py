@@ -15,6 +15,7 @@ from recorder.reader import Recording
 from replays.recordings.export import McapRun
 from replays.recordings.validation import validate
 from replays.recordings.validation.outcome import Validation
+from rig.base.errors import UnknownNameError
 from rig.base.files import write_file
 from rig.run.offline import frames
 from rig.run.scenes import load_scene
@@ -51,6 +52,22 @@ SESSIONS = {
         ReferenceSession("partial-rub", "partial-rub", {"duration_s": 0.9, "sensors.rate_hz": 5000}),
     )
 }
+
+
+def open_session(name: str) -> Recording:
+    """Open the recording of a reference session.
+
+    Raises:
+        UnknownNameError: There is no session of this name.
+
+    Example:
+        >>> import rig
+        >>> rig.open_session("hammer-6.2").samples("forces")
+        Samples(P_N, P_S, P_E, P_W [N]; 3000 rows at 5000 Hz, 0 to 0.5998 s)
+    """
+    if name not in SESSIONS:
+        raise UnknownNameError("session", "a reference session", name, SESSIONS)
+    return Recording.open(FOLDER / f"{name}.mcap")
 
 
 def make(

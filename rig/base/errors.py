@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 from rig.base.text import Words as Words
 from rig.base.text import find_similar, format_value, printable
@@ -89,6 +91,23 @@ def describe_missing_package(error: ModuleNotFoundError) -> str | None:
     if (name := (error.name or "").partition(".")[0]) not in FULL_PACKAGES:
         return None
     return f"needs {name}, which comes with the whole rig: {INSTALL_COMMAND}"
+
+
+def require_package(name: str, extra: str) -> Any:
+    """Return an optional package, imported.
+
+    Args:
+        name: Import name.
+        extra: Extra of this product that has it.
+
+    Raises:
+        ModuleNotFoundError: It is not installed; the message has the command that installs it.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        line = f"{name} is not installed: pip install 'rotor-stator-rig[{extra}]'"
+        raise ModuleNotFoundError(line, name=name) from error
 
 
 def is_full_missing() -> bool:

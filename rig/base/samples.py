@@ -6,12 +6,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import groupby
-from typing import Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
 from rig.base import units
-from rig.base.errors import InputError, UnknownNameError
+from rig.base.errors import InputError, UnknownNameError, require_package
+from rig.base.text import build_html_table
+
+if TYPE_CHECKING:
+    import pandas
+    import pyarrow
+    import xarray
 
 _SAME_INSTANT_S = 1e-6
 """Instants closer than this are equal [s]."""
@@ -98,6 +104,64 @@ class Columns(Plottable):
         """Return the rows in SI: mm to m, Hz of a speed to rad/s. Unknown units are unchanged."""
         names, sizes, zeros = zip(*map(units.get_si_unit, self.units), strict=True) if self.units else ((), (), ())
         return cast(Self, replace(cast(Any, self), units=names, values=self.values * np.array(sizes) + np.array(zeros)))
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the rows as a DataFrame with a column per name over the simulated time; `attrs` has the units.
+
+        Raises:
+            ModuleNotFoundError: pandas is not installed.
+        """
+        pandas = require_package("pandas", "notebook")
+        times_s = getattr(self, "times_s", None)
+        index = None if times_s is None else pandas.Index(times_s, name="time_s")
+        frame = pandas.DataFrame(self.values, index=index, columns=list(self.names))
+        frame.attrs["units"] = dict(zip(self.names, self.units, strict=True))
+        return frame
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the rows as a Dataset with a variable per name over `time_s`, each with its unit in `attrs`.
+
+        Raises:
+            ModuleNotFoundError: xarray is not installed.
+        """
+        xarray = require_package("xarray", "notebook")
+        times_s = getattr(self, "times_s", None)
+        dimension = "row" if times_s is None else "time_s"
+        columns = {
+            name: (dimension, column, {"units": unit})
+            for name, column, unit in zip(self.names, self.values.T, self.units, strict=True)
+        }
+        coordinates = {} if times_s is None else {"time_s": ("time_s", times_s, {"units": "s"})}
+        return xarray.Dataset(columns, coordinates)
+
+    def to_arrow(self) -> pyarrow.Table:
+        """Return the rows as an Arrow table with a column per name, and the unit of each in its field's metadata.
+
+        Raises:
+            ModuleNotFoundError: pyarrow is not installed.
+        """
+        pyarrow = require_package("pyarrow", "notebook")
+        times_s = getattr(self, "times_s", None)
+        columns = [*zip(self.names, self.units, self.values.T, strict=True)]
+        if times_s is not None:
+            columns.insert(0, ("time_s", "s", times_s))
+        schema = pyarrow.schema(
+            [
+                pyarrow.field(name, pyarrow.from_numpy_dtype(column.dtype), metadata={"unit": unit})
+                for name, unit, column in columns
+            ]
+        )
+        return pyarrow.Table.from_arrays([pyarrow.array(column) for _, _, column in columns], schema=schema)
+
+    def describe(self) -> list[tuple[str, ...]]:
+        """Return name, unit, minimum, mean and maximum of each column, as text."""
+        known = [column[np.isfinite(column)] for column in self.values.T]
+        statistics = [(column.min(), column.mean(), column.max()) if len(column) else () for column in known]
+        texts = [tuple(f"{number:.4g}" for number in each) or ("", "", "") for each in statistics]
+        return [(name, unit, *each) for name, unit, each in zip(self.names, self.units, texts, strict=True)]
+
+    def _repr_html_(self) -> str:
+        return build_html_table(repr(self), ("column", "unit", "minimum", "mean", "maximum"), self.describe())
 
     def __repr__(self) -> str:
         pairs = zip(self.units, self.names, strict=True)

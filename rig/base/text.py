@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 _MAX_CHARACTERS = 500
@@ -32,6 +32,25 @@ def printable(text: str, most: int | None = None) -> str:
     if most is not None and len(text) > most:
         text = f"{text[: most - most // 3 - 3]}...{text[len(text) - most // 3 :]}"
     return text
+
+
+def build_html_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a titled table in HTML, for objects in a notebook; all text is escaped.
+
+    Args:
+        title: Line above the table.
+        headings: Heading of each column.
+        rows: Cells of each row.
+    """
+
+    def escape(text: str) -> str:
+        return printable(text).translate({ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;"})
+
+    def line(tag: str, cells: Sequence[object]) -> str:
+        return "<tr>" + "".join(f"<{tag}>{escape(str(cell))}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "".join(line("td", row) for row in rows)
+    return f"<p>{escape(title)}</p><table><thead>{line('th', headings)}</thead><tbody>{body}</tbody></table>"
 
 
 def find_similar(name: object, known_names: Iterable[str], *, most: int = 3) -> list[str]:

@@ -74,7 +74,7 @@ COMMANDS = {
         "identify": "Fit parameters of the rig to a recording",
         "score": "Score a DAQ by comparing its recording with what the rig sent",
         "campaign": "Run scripted tests of a device in the loop",
-        "sessions": "Record the reference sessions again",
+        "sessions": "List or record again the reference sessions",
     },
     "Simulate offline": {
         "simulate": "Simulate a scene at full speed and write it to a file",

@@ -26,6 +26,7 @@ from rig.base.checks import check, read_toml
 from rig.base.errors import InputError, UnknownNameError, such_as
 from rig.base.files import is_file
 from rig.base.maths.expression import Grammar
+from rig.base.text import build_html_table
 
 SETS = Path(__file__).with_name("sets")
 DEFAULT_SET = "corrected"
@@ -124,6 +125,12 @@ class ParameterSet:
 
     def __repr__(self) -> str:
         return f"ParameterSet({self.name}: {len(self.entries)} parameters)"
+
+    def _repr_html_(self) -> str:
+        rows = [(key, each.value, each.unit, each.symbol, each.kind, each.source) for key, each in self.entries.items()]
+        return build_html_table(
+            f"{self!r}: {self.title}", ("parameter", "value", "unit", "symbol", "kind", "source"), rows
+        )
 
     def override(self, changes: dict[str, Any], *, kind: Kind = "assumed", source: str = "override") -> ParameterSet:
         """Return the set with some values replaced, each in its parameter's own unit.

@@ -14,6 +14,7 @@ import numpy as np
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.files import whole_file
 from rig.base.samples import Plottable, Samples, find_column, merge_samples
+from rig.base.text import build_html_table
 from rig.channels.formula import check_computed
 from rig.channels.table import ChannelTable
 from rig.physics.kernels.signals import COLUMN, N_ROW, ROW
@@ -96,6 +97,11 @@ class Run(Plottable):
             f"{rate:g} Hz of {len(self.names)} signals and {len(self.table.channels)} channels; "
             f"{scene.engine.name} {scene.engine.step_us} us, seed {scene.seed})"
         )
+
+    def _repr_html_(self) -> str:
+        events = [(f"{each['time_s']:g} s", each["event"], "", "", "") for each in self.events]
+        rows = [*(row for table in self.sampled for row in table.describe()), *events]
+        return build_html_table(repr(self), ("channel or event", "unit", "minimum", "mean", "maximum"), rows)
 
     @property
     def samples(self) -> Samples:

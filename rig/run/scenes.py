@@ -13,6 +13,7 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 from rig.base.checks import Written, check, get_table, parse_toml, read_toml
 from rig.base.errors import InputError, Words, such_as
 from rig.base.files import is_file
+from rig.base.text import build_html_table
 from rig.channels.channel_file import check_table, read_channels
 from rig.channels.faults import Setting
 from rig.channels.formula import Formulas
@@ -195,6 +196,13 @@ class Scene(Written):
         )
 
     __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[str, object]] = []
+        for name, value in self.model_dump(mode="json", exclude_defaults=True, exclude={"channels"}).items():
+            parts = {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
+            rows += parts.items()
+        return build_html_table(repr(self), ("setting (others: the default)", "value"), rows)
 
     @property
     def fidelity_line(self) -> str | None:

@@ -168,7 +168,7 @@ class Interfaces:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self._stack = folder, ExitStack()
-        self.thorough = False
+        self.thorough, self.rare = False, 1
         self._made: dict[str, Any] = {}
 
     def __enter__(self) -> Interfaces:
@@ -298,8 +298,8 @@ class Interfaces:
                 judge(path, [self.session()])
 
     def selects(self, path: Path, one_of: int) -> bool:
-        """Return whether the content of a file selects it for long work; every kept input is."""
-        return self.thorough or zlib.crc32(path.read_bytes()) % one_of == 0
+        """Return whether a file is one of the few for long work, by its content; in a long run fewer, if kept every."""
+        return self.thorough or zlib.crc32(path.read_bytes()) % (one_of * self.rare) == 0
 
     def can_logs(self) -> Interface:
         self.session()
@@ -380,7 +380,7 @@ class Interfaces:
             assert Session([path]).trigger_s is not math.nan
             number = zlib.crc32(changes.read_bytes())
             uses = list(operations.values())
-            for operation in uses if self.thorough else [uses[number % len(uses)]]:
+            for operation in uses if self.thorough else [uses[number % len(uses)]] if self.selects(changes, 1) else []:
                 with contextlib.suppress(InputError):
                     operation(path, self.folder)
 
@@ -495,7 +495,7 @@ def serve_lockstep(server: Any = None) -> Iterator[tuple[Any, Any]]:
         yield server, service
     finally:
         service.stop()
-        thread.join(5.0)
+        thread.join(60.0)
     assert summary.get("reason") == "stopped", summary or "the run does not end"
     assert summary["troubles"] == [], summary["troubles"]
 

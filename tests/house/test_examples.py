@@ -23,6 +23,8 @@ MODULES = (
     "drivers.daq",
     "recorder.reader",
     "replays.recordings.export",
+    "replays.sessions.session",
+    "rig.cli.output.progress",
     "rig.physics.contacts",
     "rig.base.errors",
     "rig.physics.magnets",

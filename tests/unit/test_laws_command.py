@@ -130,7 +130,7 @@ def test_picture_labels_every_axis_and_law(monkeypatch: pytest.MonkeyPatch, tmp_
         (["--restitution", "0.01"], "contact.restitution must be"),
         (["--set", "contact.damping_factor=hertz"], "contact.damping_factor must be"),
         (["--set", "contact.exponent=1.5", "--set", "contact.damping_factor=kelvin-voigt"], "contact.exponent must be"),
-        (["--plot", "laws.pdf"], "--plot must be a .png or .svg file"),
+        (["--plot", "laws.pdf"], "--plot must be a file name that ends in .png or .svg"),
         (["nonsense"], "parameters must be one of"),
     ],
 )

@@ -96,7 +96,7 @@ def test_picture_is_drawn_the_same_each_time(capsys: pytest.CaptureFixture[str],
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--plot", "magnets.pdf"], "--plot must be a .png or .svg file"),
+        (["--plot", "magnets.pdf"], "--plot must be a file name that ends in .png or .svg"),
         (["--set", "magnet.count=13"], "magnet.count must be at most 12, or the magnets would overlap"),
         (["--set", "magnet.stiffness=magpylib"], "or one of eq35, cylinders"),
         (["nowhere"], "parameters must be one of corrected"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from replays.recordings.validation.statistics import StatisticResult
 from replays.recordings.validation.trajectory import ChannelResidual
 from replays.recordings.validation.truth import TruthResult
 from rig.base.outcome import Outcome
+from rig.base.text import build_html_table
 from rig.base.wire import TRUTH as TRUTH_KEY
 from rig.channels.faults.defects import defects_in, earlier_name
 
@@ -106,6 +107,10 @@ class Validation:
     contact_s: float | None = None
     due_s: float | None = None
     complete: bool = True
+
+    def _repr_html_(self) -> str:
+        title = f"{self.title}, by {self.criteria}: {self.outcome}; {self.bits_line}"
+        return build_html_table(title, ("criterion not met", "recorded", "model", "limit"), map(astuple, self.failures))
 
     @property
     def outcome(self) -> Outcome:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from replays.report import junit
 from rig.base.errors import UnknownNameError
 from rig.base.outcome import Outcome
-from rig.base.text import replace_nonfinite
+from rig.base.text import build_html_table, replace_nonfinite
 from rig.channels.faults.defects import defects_shown
 
 PASS, FAIL, INCONCLUSIVE, NO_LIMIT = "pass", "fail", "inconclusive", "no limit"
@@ -272,6 +272,10 @@ class Scorecard:
         """Judge an estimate by the limit for the session's channel `of` and for further inputs, and add the row."""
         limit = self.find_limit(self.path, quantity, of, **inputs)
         self.rows.append(judge_row(self.path, quantity, channel, estimate, unit=unit, limit=limit, note=note))
+
+    def _repr_html_(self) -> str:
+        headings = ("quantity", "channel", "value", "interval", "unit", "limit", "verdict")
+        return build_html_table(f"{self.title}: {self.verdict_line}", headings, [row.cells() for row in self.rows])
 
     @property
     def outcome(self) -> Outcome:

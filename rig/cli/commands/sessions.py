@@ -1,4 +1,4 @@
-"""`rig sessions`: record the reference sessions again."""
+"""`rig sessions`: list the reference sessions, or record them again."""
 
 from __future__ import annotations
 
@@ -15,18 +15,27 @@ from rig.cli.output.tables import echo
 
 
 def sessions(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[SESSION]...", help="Record only these")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[SESSION]...", help="Only these")] = None,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder; created if missing")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Record them again in this folder")
+    ] = None,
     force: Force = False,
 ) -> None:
-    """Record the reference sessions again: small recordings, with their quantities as text for review as a diff."""
-    from replays.sessions import SESSIONS, make
+    """List the reference sessions, small recordings installed with the rig, or record them again.
+
+    With -o, their quantities are also written as text, for review as a diff.
+    """
+    from replays.sessions import FOLDER, SESSIONS, make
 
     chosen = names or list(SESSIONS)
     for name in chosen:
         if name not in SESSIONS:
             raise InputError("session", f"one of {', '.join(SESSIONS)}", name)
+    if output is None:
+        for name in chosen:
+            echo(str(FOLDER / f"{name}.mcap"))
+        return
     check_folder(output, field="--output")
     existing = [path for name in chosen for path in (output / f"{name}.mcap", output / f"{name}.toml") if path.exists()]
     if existing and not force:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from rig.base.files import check_new_file
 from rig.cli.output.tables import Form, echo, echo_json
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def print_comparison(
         form: Output as tables or as JSON.
     """
     if plot is not None:
+        check_new_file(plot, field="--plot", suffixes=(".png", ".svg"), force=True)
         draw(subject, plot)
     document = compare(subject)
     if form.as_json:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
@@ -85,10 +85,10 @@ def reporting(*, live: bool = True, compiles: bool = False) -> Iterator[Reporter
     """Yield a `Reporter` that shows the progress of the block.
 
     Args:
-        live: Use a live line on a terminal.
+        live: Use a live line on a terminal or in a notebook.
         compiles: Also show the compiling of kernels.
     """
-    with _bar() if live and sys.stderr.isatty() else nullcontext(Reporter()) as reporter:
+    with _bar() if live and _is_live() else nullcontext(Reporter()) as reporter:
         if not compiles:
             yield reporter
             return
@@ -101,6 +101,31 @@ def reporting(*, live: bool = True, compiles: bool = False) -> Iterator[Reporter
         )
         with install_listener("numba:compile", compiling):
             yield reporter
+
+
+@contextmanager
+def show_progress(text: str = "") -> Iterator[Callable[[float], None]]:
+    """Yield a function of the finished fraction, 0 to 1, that shows a progress bar on a terminal or in a notebook.
+
+    Args:
+        text: Description of the work.
+
+    Example:
+        >>> import rig
+        >>> with rig.show_progress("impact") as progress:
+        ...     run = rig.simulate("hammer", duration_s=0.05, progress=progress)
+    """
+    with reporting() as reporter:
+        yield lambda done: reporter.part(done, text)
+
+
+def _is_live() -> bool:
+    """Return whether stderr shows a live line: a terminal, or the output of a notebook's cell."""
+    if "IPython" not in sys.modules:
+        return sys.stderr.isatty()
+    from rich.console import Console
+
+    return sys.stderr.isatty() or Console().is_jupyter
 
 
 @contextmanager
