@@ -25,8 +25,8 @@ from rig.serve.transport.clients import Reporter
 NAME = "viewer"
 ROWS_PER_S = 500.0
 """Points of each curve per simulated second [Hz], except for full rate around hammer pulses."""
-SAVING_INTERVAL_S = 10.0
-"""Time over which data are written to a file together [s]; rerun keeps 1 kB in memory for each written piece."""
+SAVING_INTERVAL_S = 1.0
+"""Time over which data are written to a file together [s]: a longer one needs more memory, a shorter one more disk."""
 _TICK_S = MIN_INTERVAL_S
 _HEARTBEAT_INTERVAL_S = 0.5
 _MAX_WAITING = 4000

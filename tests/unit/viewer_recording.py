@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,11 +119,15 @@ class Saved:
 
     def __init__(self, path: Path) -> None:
         from rerun.chunk import RrdReader
+        from rerun.error_utils import RerunWarning
 
         self.timelines: set[str] = set()
         self.columns: dict[tuple[str, str], Column] = {}
         found: dict[tuple[str, str], list[tuple[float, float, Any]]] = {}
-        for chunk in RrdReader(path).stream().to_chunks():
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)  # as after a live view
+            chunks = RrdReader(path).stream().to_chunks()
+        for chunk in chunks:
             self.timelines.update(chunk.timeline_names)
             batch = chunk.to_record_batch()
             names = batch.schema.names

@@ -48,7 +48,7 @@ def view(
     With a display it opens a window; otherwise it serves the viewer on 127.0.0.1 and prints the address.
     """
     _check(files, live=live, web=web, save=save, screenshot=screenshot, at_s=at_s, force=force)
-    _suppress_logging()
+    _prepare_rerun()
     from recorder.viewer.window import WindowError
 
     try:
@@ -137,7 +137,7 @@ def _view_live(connection: Connection, *, web: bool, save: Path | None, only: st
         plan = blueprint.layout(described.table, described.geometry, live=True, only=only)
         if save is not None:
             view = live.LiveView(client, Canvas(stream), described, interval_s=live.SAVING_INTERVAL_S)
-            with _saved(stream, save, plan, until_interrupted=True):
+            with _saved(stream, save, plan, live=True):
                 echo(view.run())
             if view.failed:
                 raise typer.Exit(1)
@@ -199,11 +199,12 @@ def _wait_for_the_end(shown: Window) -> None:
         raise RefusedError(f"the viewer failed: {shown.failure} (--web needs no graphics driver)")
 
 
-def _suppress_logging() -> None:
-    """Keep rerun's own log off the terminal: a closed window is not an error here."""
+def _prepare_rerun() -> None:
+    """Keep rerun's log off the terminal, as a closed window is not an error here, and let it release memory at once."""
     import os
 
     os.environ.setdefault("RUST_LOG", "off")
+    os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")  # ms; otherwise a live view grows for a quarter of an hour
 
 
 def _connect(stream: rr.RecordingStream, shown: Window, plan: rrb.Blueprint) -> None:
@@ -220,32 +221,30 @@ def _close(stream: rr.RecordingStream, *, timeout_s: float = 5.0) -> None:
 
 
 @contextmanager
-def _saved(
-    stream: rr.RecordingStream, path: Path, plan: rrb.Blueprint, *, until_interrupted: bool = False
-) -> Iterator[None]:
+def _saved(stream: rr.RecordingStream, path: Path, plan: rrb.Blueprint, *, live: bool = False) -> Iterator[None]:
     """Write the drawing to a file that gets its name once it is complete.
 
     Args:
         stream: Stream to draw to.
         path: The file.
         plan: The blueprint.
-        until_interrupted: Keep the file after Ctrl-C.
+        live: Keep the file after Ctrl-C, and write no table of contents, as rerun keeps it in memory until the end.
     """
     from recorder.viewer.canvas import piped
 
     with whole_file(path) as draft:
         with draft.open("wb") as file, piped(file) as pipe:
-            stream.save(pipe, default_blueprint=plan)
+            stream.save(pipe, default_blueprint=plan, write_footer=not live)
             try:
-                with suppress(*([KeyboardInterrupt] if until_interrupted else [])):
+                with suppress(*([KeyboardInterrupt] if live else [])):
                     yield
                 stream.flush(timeout_sec=60.0)
             finally:
                 stream.disconnect()
-        # rerun only logs a failure; a complete file ends with its table of contents.
+        # rerun only logs a failure; a complete file of a recording ends with its table of contents.
         with draft.open("rb") as file:
             file.seek(max(0, draft.stat().st_size - 64))
-            if b"RRF2FOOT" not in file.read():
+            if not live and b"RRF2FOOT" not in file.read():
                 raise DiskError(f"{path} could not be written completely; it was removed")
 
 
