@@ -8,6 +8,8 @@ from functools import partial
 from inspect import signature
 from typing import Any
 
+from replays.plots.campbell import campbell
+from replays.plots.contact import contact, restitution, rolling
 from replays.plots.orbits import centreline, orbit
 from replays.plots.plot import Plot
 from replays.plots.signals import Signals
@@ -27,6 +29,10 @@ KINDS: Mapping[str, Callable[..., Plot]] = {
     "bode": bode,
     "polar": polar,
     "trend": trend,
+    "campbell": campbell,
+    "contact": contact,
+    "restitution": restitution,
+    "rolling": rolling,
 }
 """Functions by name, in the order of `rig plot`."""
 

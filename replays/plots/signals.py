@@ -10,8 +10,8 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any, NamedTuple
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from rig.base.wire import sensor_key, truth_key
 from rig.channels.orbit import PULSE_LEVEL, find_edges, fit_turns
 from rig.channels.table import ChannelTable
 from rig.physics.parameters import SI
+
+if TYPE_CHECKING:
+    from rig.physics.model import Model
 
 _AXIS = re.compile(r"(.*?)[ _.-]?([xy])", re.IGNORECASE)
 """Name of a probe of a pair: a common part, and its direction."""
@@ -87,6 +90,8 @@ class Signals:
         load: Reads a group.
         load_edges: Reads the keyphasor's passages between two times [s].
         clearances: Clearance by channel, in its unit.
+        events: Reads the events.
+        model: Builds the model of the rig; None for data without one.
         runout: Run-out to subtract.
         probe_angles_deg: Directions of the x and the y probe, counter-clockwise from the right [degrees].
     """
@@ -97,6 +102,8 @@ class Signals:
     load: Load
     load_edges: Callable[[float, float], np.ndarray]
     clearances: Mapping[str, float]
+    events: Callable[[], Sequence[Mapping[str, Any]]] = list
+    model: Callable[[], Model] | None = None
     runout: Runout | None = None
     probe_angles_deg: tuple[float, float] = (0.0, 90.0)
 
@@ -120,6 +127,16 @@ class Signals:
         if len(edges_s := self.edges_s) < 2:
             raise InputError(what, "drawn with at least two keyphasor passages", Words(f"{len(edges_s)}"))
         return edges_s
+
+    def require_model(self, what: str) -> Model:
+        """Return the model of the rig.
+
+        Raises:
+            InputError: The data are without one, or this version does not know its parameters.
+        """
+        if self.model is None:
+            raise InputError(what, "drawn of a run or a recording of the rig, which has its model", Words("none"))
+        return self.model()
 
     def read(self, *names: str) -> Samples:
         """Return channels, with the rows that all of them have, in order of time.
@@ -387,6 +404,8 @@ def _read_run(run: Any) -> Signals:
         load=load,
         load_edges=lambda *_: run.edges_s,
         clearances=_compute_clearances(run.table, run.simulation.parameters_document()["values"]),
+        events=lambda: run.events,
+        model=lambda: run.simulation.model,
     )
 
 
@@ -425,7 +444,27 @@ def _read_recording(recording: Any) -> Signals:
         load=load,
         load_edges=load_edges,
         clearances=_compute_clearances(recording.table, recording.parameters.get("values", {})),
+        events=lambda: recording.events,
+        model=partial(_build_model, recording) if isinstance(recording.scene.get("scene"), dict) else None,
     )
+
+
+def _build_model(recording: Any) -> Model:
+    """Return the model of a recording, from its parameters.
+
+    Raises:
+        InputError: This version does not know one of them.
+    """
+    from rig.physics.levels import ModelLevels
+    from rig.physics.model import build_model
+    from rig.physics.parameters import load_parameters
+
+    values = {key: entry["value"] for key, entry in recording.parameters.get("values", {}).items()}
+    try:
+        levels = ModelLevels(**recording.scene["scene"].get("model", {}))
+        return build_model(load_parameters().override(values), levels)
+    except (TypeError, ValueError) as error:
+        raise InputError("recording", "of a model that this version knows", str(recording.path)) from error
 
 
 def _find_pulses(samples: Samples) -> np.ndarray:

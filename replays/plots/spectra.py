@@ -86,8 +86,8 @@ def waterfall(
         Axes and table: time, frequency and amplitude.
     """
     probes = signals.read_pair(pair)
-    window_s = _choose_window(probes) if window_s is None else window_s
-    times_s, frequency, amplitude = _compute_spectra(probes, max_hz, window_s)
+    window_s = choose_window(probes) if window_s is None else window_s
+    times_s, frequency, amplitude = compute_spectra(probes, max_hz, window_s)
     note = f"{describe_frame(signals)}; Hann windows of {window_s:g} s; gaps in the data are left open"
     title = describe_title(signals, f"Waterfall at {probes.name}")
     return _draw_map(axes, probes, times_s, frequency, amplitude, title, note, ("frequency", "Hz", _SIDES))
@@ -174,8 +174,8 @@ def cascade(
         InputError: The speed changes by less than a tenth, or there is no keyphasor.
     """
     probes, edges_s = signals.read_pair(pair), signals.require_edges("cascade")
-    window_s = _choose_window(probes) if window_s is None else window_s
-    times_s, frequency, amplitude = _compute_spectra(probes, max_hz, window_s)
+    window_s = choose_window(probes) if window_s is None else window_s
+    times_s, frequency, amplitude = compute_spectra(probes, max_hz, window_s)
     speed_hz = np.interp(times_s, 0.5 * (edges_s[1:] + edges_s[:-1]), 1.0 / np.diff(edges_s))
     usable = np.isfinite(amplitude).all(axis=1) & (times_s >= edges_s[0]) & (times_s <= edges_s[-1])
     speed_hz, amplitude = speed_hz[usable], amplitude[usable]
@@ -230,13 +230,13 @@ def _limit(
     return frequency[shown], amplitude[..., shown]
 
 
-def _choose_window(probes: Pair) -> float:
+def choose_window(probes: Pair) -> float:
     """Return the length of a window for the length of the data [s]."""
     span_s = float(np.ptp(probes.samples.times_s))
     return round(min(max(0.1 * span_s, 0.15), 1.0, 0.5 * span_s), 3)
 
 
-def _compute_spectra(probes: Pair, max_hz: float | None, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def compute_spectra(probes: Pair, max_hz: float | None, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times, frequencies and amplitudes of spectra, with nan at gaps.
 
     Raises:

@@ -37,7 +37,7 @@ BUDGETS = {
     "replays/campaigns": 3314,
     "replays/estimate": 337,
     "replays/player": 816,
-    "replays/plots": 974,
+    "replays/plots": 1282,
     "replays/recordings": 10375,
     "replays/report": 491,
     "replays/score": 4247,
