@@ -5,7 +5,7 @@ The two-sided spectrum of an orbit x + j y is `rig.channels.orbit.full_spectrum`
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -75,6 +75,24 @@ def transfer(x: np.ndarray, y: np.ndarray, rate_hz: float, rows: int) -> tuple[n
     with np.errstate(divide="ignore", invalid="ignore"):
         coherence = np.minimum(1.0, np.abs(sxy) ** 2 / (sxx * syy))
         return f, sxx, np.abs(sxy) / sxx, coherence
+
+
+def window_spectra(x: np.ndarray, y: np.ndarray, rate_hz: float) -> tuple[np.ndarray, ...]:
+    """Average power and cross spectra of whole windows, such as those after hammer hits, without a taper.
+
+    Args:
+        x: Input signal, shape (windows, rows).
+        y: Output signal, of the same shape.
+        rate_hz: Sample rate [Hz].
+
+    Returns:
+        Frequencies [Hz], power densities of x and of y, and complex cross density, each of shape (rows // 2 + 1,).
+    """
+    from scipy.signal import csd, welch
+
+    settings: Any = {"fs": rate_hz, "window": "boxcar", "nperseg": x.shape[1], "noverlap": 0, "detrend": False}
+    f, sxx = welch(x.ravel(), **settings)
+    return f, sxx, welch(y.ravel(), **settings)[1], csd(x.ravel(), y.ravel(), **settings)[1]
 
 
 def parabola_top(before: float, middle: float, after: float) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from replays.plots.campbell import campbell
 from replays.plots.contact import contact, restitution, rolling
+from replays.plots.modal import frequency_response, modes
 from replays.plots.orbits import centreline, orbit
 from replays.plots.plot import Plot
 from replays.plots.signals import Signals
@@ -29,6 +30,8 @@ KINDS: Mapping[str, Callable[..., Plot]] = {
     "bode": bode,
     "polar": polar,
     "trend": trend,
+    "frequency_response": frequency_response,
+    "modes": modes,
     "campbell": campbell,
     "contact": contact,
     "restitution": restitution,
@@ -64,7 +67,9 @@ def list_pictures(signals: Signals, kinds: Sequence[str] = ()) -> dict[str, Call
         if kind == "timebase":
             each = {group: {"channels": names} for group, names in groups.items()}
         elif pairs and (option := {"pair", "channels"} & signature(function).parameters.keys()):
-            each = {pair: dict.fromkeys(option, pair) for pair in pairs}
+            each = {
+                pair: dict.fromkeys(option, pair) for pair in (signals.pairs if kind == "frequency_response" else pairs)
+            }
         for name, options in each.items() if kind in (kinds or KINDS) else ():
             pictures[re.sub(r"[^\w.-]+", "_", f"{kind}-{name}").rstrip("-")] = partial(function, signals, **options)
     return pictures

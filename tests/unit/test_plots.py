@@ -20,7 +20,7 @@ from rig.base.samples import Samples
 
 RATE_HZ = 5000.0
 SPEED_HZ = 7.0
-NEED_MORE = ("campbell", "contact", "restitution", "rolling")
+NEED_MORE = ("frequency_response", "modes", "campbell", "contact", "restitution", "rolling")
 """Kinds that need a model or its truth."""
 SESSION = "replays/sessions/hammer-6.2.mcap"
 
@@ -398,7 +398,7 @@ def test_the_command_draws_each_pair_and_group(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--only", "orbti"], "rig: --only must be kinds of plots, such as orbit (14 in all); received 'orbti'\n"),
+        (["--only", "orbti"], "rig: --only must be kinds of plots, such as orbit (16 in all); received 'orbti'\n"),
         (["--only", "bode"], "rig: speed must be that of a run-up or a coast-down, which changes by a tenth; received"),
         (["--from", "5"], "rig: --from and --to must be within 0 to 0.5998 s; received 5.0 to None\n"),
         (["--onyl", "orbit"], "rig: option must be one of `rig plot -h`, such as --only"),
