@@ -11,7 +11,7 @@ from replays.estimate.least_squares import solve
 from replays.estimate.runs import find_true_runs
 from replays.plots.plot import Plot, Table, describe_frame, describe_title, kind, make_axes
 from replays.plots.signals import TRUTH, Signals, break_lines, compute_revolutions
-from replays.report.canvas import BLACK, BLUE, RED, SKY, axis_label
+from replays.report.canvas import BLACK, BLUE, ORANGE, SKY, axis_label
 from rig.base.errors import InputError, Words
 from rig.base.samples import Samples
 from rig.channels.orbit import phase
@@ -199,7 +199,7 @@ def rolling(signals: Signals, *, pair: str | None = None, axes: Any = None) -> P
             law = -constants.shaft.radius / (constants.contact.clearance + depth)
             line = whirl[begin] + law * (turns[begin:end] - turns[begin])
             label = f"rolling: {law:.3f}".replace("-", "−")
-            angle.plot(turns[begin:end], line, "--", color=RED, lw=1.4, label=label)
+            angle.plot(turns[begin:end], line, "--", color=ORANGE, lw=1.4, label=label)
     angle.set(xlabel="rotation of the shaft [turns]", ylabel="angle of the centre [turns]")
     angle.legend(loc="best")
     columns = {
