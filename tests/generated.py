@@ -21,7 +21,7 @@ def missing_in_generated_files() -> Iterator[str]:
     keys = Path(rig.__file__).with_name("KEYS.md")
     for name, path, arguments, command in (
         ("rig/KEYS.md", keys, ("keys", "--markdown"), "rig keys --markdown > rig/KEYS.md"),
-        ("drivers/can/rig.dbc", dbc.COPY, ("can", "dbc"), "rig can dbc -o drivers/can/rig.dbc"),
+        ("drivers/can/rig.dbc", dbc.COPY, ("can", "dbc"), "rig can dbc -o drivers/can/rig.dbc --force"),
     ):
         # Another process uses the rig's own channel table, not that of the tests.
         made = subprocess.run([sys.executable, "-m", "rig", *arguments], capture_output=True, check=True)

@@ -7,6 +7,7 @@ with `@house_style()`, which sets matplotlib's defaults while they run and resto
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 
 from rig.base.errors import InputError
 from rig.base.files import write_file
+from rig.base.text import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,6 +40,8 @@ _MIN_BAND_PERIODS, _MAX_SLICES = 80, 240
 """Periods from which a signal is drawn as a band, and the largest number of time slices in the band."""
 _SALT = "rotor-stator-rig"
 """Salt of the identifiers in an SVG, so that they are reproducible."""
+_NOT_IN_XML = re.compile("[^\t\n\r\x20-\u2029\u202f-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Control characters and marks of direction in names, which are not XML or change how a line is read."""
 _STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
@@ -260,4 +264,4 @@ def _svg(figure: Figure, source: str) -> bytes:
     buffer = io.BytesIO()
     # Without a date and with fixed identifiers, equal data give an equal file.
     figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None, "Source": source or None})
-    return buffer.getvalue()
+    return _NOT_IN_XML.sub(lambda found: printable(found[0]), buffer.getvalue().decode()).encode()

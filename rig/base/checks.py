@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from rig.base.errors import InputError, RefusedError, Words, such_as
-from rig.base.files import open_file
+from rig.base.files import read_file
 from rig.base.text import printable
 
 DOCUMENT_BYTES = 16 << 20
@@ -125,9 +125,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         InputError: The file cannot be read, is not TOML, or is out of bounds (see `parse_toml`).
     """
     try:
-        with open_file(path) as file:
-            data = file.read(TOML_BYTES + 1)
-        return parse_toml(data.decode("utf-8-sig"), field=str(path))
+        return parse_toml(read_file(path, TOML_BYTES).decode("utf-8-sig"), field=str(path))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(str(path), "a TOML file", Words(printable(str(error), 200))) from None
     except OSError as error:

@@ -7,6 +7,7 @@ written to a new file with a name that cannot be guessed, so that no symbolic li
 from __future__ import annotations
 
 import errno
+import io
 import os
 import secrets
 import stat
@@ -27,6 +28,8 @@ PART_SUFFIX = ".part"
 _MAX_NAME = 50
 """Characters of a file name in that of its draft; a name has at most 255 bytes, a character up to four."""
 _MAX_INFLATED, _MAX_RATIO = 256 << 20, 100
+_MAX_LINE = 1 << 21
+"""Longest line of a text file [characters]; pyarrow accepts no longer line in its blocks."""
 
 
 def open_file(path: Path) -> BufferedReader:
@@ -44,6 +47,35 @@ def open_file(path: Path) -> BufferedReader:
         return number
 
     return open(path, "rb", opener=opener)
+
+
+def read_file(path: Path, most_bytes: int) -> bytes:
+    """Return the contents of a regular file.
+
+    Raises:
+        OSError: The file cannot be read, is not a regular file, or is larger than `most_bytes`.
+    """
+    with open_file(path) as file:
+        data = file.read(most_bytes + 1)
+    if data is None or len(data) > most_bytes:  # None: a file of the kernel that has no data yet
+        reason = "no data" if data is None else f"larger than {most_bytes / 1048576:g} MB"
+        raise OSError(errno.EFBIG, reason, str(path))
+    return data
+
+
+class TextLines(io.TextIOWrapper):
+    """A text file whose lines have a limited length, so that a line without an end cannot fill the memory."""
+
+    def readline(self, size: int = -1, /) -> str:
+        """Return the next line, as an iteration does.
+
+        Raises:
+            ValueError: The line has more than 2 million characters.
+        """
+        line = super().readline(_MAX_LINE if size < 0 else size)
+        if len(line) == _MAX_LINE:
+            raise ValueError(f"a line of more than {_MAX_LINE} characters")
+        return line
 
 
 def is_file(path: Path) -> bool:
@@ -115,7 +147,9 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
         raise InputError(field, "in a folder that exists", str(path))
     if path.is_dir():
         raise InputError(field, "a file, not a folder", str(path))
-    if path.exists() and not force:
+    if path.exists() and not path.is_file():
+        raise InputError(field, "a file, not a pipe, socket or device", str(path))
+    if os.path.lexists(path) and not force:
         raise InputError(field, "a new file (--force replaces one)", Words(f"{path}, which exists"))
     try:
         # Permissions alone are not sufficient: try it.
@@ -141,16 +175,20 @@ def check_output_differs(sources: list[Path], output: Path, *, field: str = "out
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary file that replaces `path` if the block succeeds, and is removed otherwise.
 
-    A symbolic link at `path` is replaced, not followed. A killed process leaves the temporary file, whose name ends in
-    .part.
+    A symbolic link at `path` is replaced, not followed. A file that another process creates there meanwhile is kept,
+    and the temporary file too. A killed process leaves the temporary file, whose name ends in .part.
 
     Raises:
         DiskError: The disk refused, whatever error the writing library raised.
     """
+    existed = os.path.lexists(path)
     draft = path.with_name(f"{path.name[:_MAX_NAME]}.{secrets.token_hex(8)}{PART_SUFFIX}")
     try:
         os.close(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield draft
+        if not existed and not _claim(draft, path):
+            kept = draft.rename(draft.with_suffix(path.suffix))
+            raise DiskError(f"{path} was created by another process meanwhile; this output is {kept}")
         draft.replace(path)
     except (InputError, SimulationError, DiskError):
         raise
@@ -164,6 +202,17 @@ def whole_file(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             draft.unlink(missing_ok=True)
+
+
+def _claim(draft: Path, path: Path) -> bool:
+    """Give a draft its final name as well; return False if the name is taken."""
+    try:
+        os.link(draft, path)
+    except FileExistsError:
+        return False
+    except OSError:  # a file system without links: the draft is only renamed
+        pass
+    return True
 
 
 def write_file(path: Path, data: str | bytes) -> None:

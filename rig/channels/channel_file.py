@@ -36,7 +36,7 @@ from pydantic import AfterValidator, ConfigDict, Field
 
 from rig.base.checks import TOML_BYTES, Written, check, read_toml
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.files import open_file
+from rig.base.files import read_file
 from rig.base.text import printable
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import TABLE, Channel, ChannelTable, build_table, raw_groups
@@ -212,8 +212,7 @@ def _curve(name: str, source: str | tuple[tuple[float, float], ...], folder: Pat
         points = source
     else:
         try:
-            with open_file(folder / source) as file:
-                lines = file.read(TOML_BYTES).decode("utf-8-sig").splitlines()
+            lines = read_file(folder / source, TOML_BYTES).decode("utf-8-sig").splitlines()
             rows = [row.split(",") for line in lines if (row := line.partition("#")[0].strip())]
             points = tuple((float(degrees), float(value)) for degrees, value in rows)
         except OSError as error:

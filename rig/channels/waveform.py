@@ -12,7 +12,7 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from rig.base.checks import Written
 from rig.base.errors import InputError, Words
-from rig.base.files import open_file
+from rig.base.files import read_file
 
 _MAX_VALUES, _MAX_FILE_BYTES = 200_000, 8 << 20
 """Limits of a waveform's values and of its file size [bytes]; each recording contains the waveform."""
@@ -58,12 +58,9 @@ def read_waveform(path: Path) -> Waveform:
         InputError: The file cannot be read or is not such a file.
     """
     try:
-        with open_file(path) as file:
-            data = file.read(_MAX_FILE_BYTES + 1)
+        data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise InputError(_FIELD, "a file that can be read", Words(f"{path} ({error.strerror})")) from None
-    if len(data) > _MAX_FILE_BYTES:
-        raise InputError(_FIELD, f"at most {_MAX_FILE_BYTES >> 20} MB", Words(f"{path}, which is larger"))
     try:
         headings, *rows = [row for row in csv.reader(data.decode("utf-8-sig").splitlines()) if row]
         numbers = np.array(rows, dtype=float)

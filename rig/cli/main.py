@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gc
 import io
+import logging
 import os
 import sys
+import warnings
 
 from rig.cli import signals
 
@@ -20,12 +22,27 @@ def main(arguments: list[str] | None = None) -> None:
     start(arguments)
 
 
+def _open_closed_streams() -> None:
+    """Open the null device for a standard stream that is closed; the next opened file would take its number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest free number
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115 until the process ends
+
+
 def entry() -> None:
     """Run the command as a separate process."""
     # The matrices are small: threads of BLAS waiting for each other take half of the processor time without any gain,
     # and the rounding of sums depends on the number of threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signals.listen()
+    _open_closed_streams()
+    # Libraries log and warn with texts of the input, which may control a terminal; the command reports what is wrong.
+    logging.getLogger().addHandler(logging.NullHandler())
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a character missing from the encoding is escaped

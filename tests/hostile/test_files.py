@@ -11,6 +11,8 @@ import json
 import os
 import re
 import struct
+import subprocess
+import sys
 import time
 import tracemalloc
 import zlib
@@ -24,13 +26,15 @@ import pytest
 from recorder.files.records import MAGIC
 from recorder.reader import Recording, join
 from recorder.rewrite import is_whole, recover
+from replays.campaigns.files.campaign import load_campaign
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import open_source
 from replays.score.records.can_log import open_can_log
+from replays.studies.common.journal import Journal
 from rig.base.errors import InputError
 from rig.channels.table import default_table
 from rig.cli.main import main
-from tests.hostile import InputTally, check_tallies, input_count
+from tests.hostile import InputTally, check_tallies, input_count, limit_processor_time
 from tests.hostile.files import (
     PROBES,
     SESSIONS,
@@ -413,3 +417,62 @@ def test_compressed_data_are_measured_before_a_library_reads_them(tmp_path: Path
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100e6
+
+
+@pytest.mark.parametrize("suffix", [".mf4", ".blf", ".log", ".trc", ".asc", ".csv", ".wav", ".parquet", ".toml"])
+def test_a_sparse_file_of_a_terabyte_is_refused_at_once(suffix: str, tmp_path: Path) -> None:
+    blf = struct.pack("<4sI136x4sHHII16x", b"LOGG", 144, b"LOBJ", 16, 1, 0xF0000000, 10)
+    heads = {".mf4": b"MDF     4.10    ", ".blf": blf, ".asc": b"date "}
+    path = tmp_path / f"a{suffix}"
+    with path.open("wb") as file:
+        file.write(heads.get(suffix, b""))
+        file.truncate(1 << 40)
+    with pytest.raises(InputError), limit_processor_time(20.0):  # noqa: PT012
+        if suffix == ".toml":
+            load_campaign(path)
+        elif suffix in (".blf", ".log", ".trc", ".asc"):
+            open_can_log(path, default_table())
+        else:
+            open_source(path, FileOptions())
+
+
+def test_the_columns_of_a_parquet_file_are_measured_before_they_are_read(tmp_path: Path) -> None:
+    from pyarrow import array, parquet, table
+
+    zeros = array(np.zeros(4_000_000))
+    parquet.write_table(table({f"x{n}": zeros for n in range(12)}), tmp_path / "a.parquet")
+    assert (tmp_path / "a.parquet").stat().st_size < 1 << 20
+    with pytest.raises(InputError, match="4000000 rows of 12 columns"):
+        open_source(tmp_path / "a.parquet", FileOptions())
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"of another program", b"[]\n", b"[" * 3000 + b"\n", b'{"a": 1}\nx'])
+def test_a_journal_of_another_program_is_refused_and_kept(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "j.jsonl").write_bytes(content)
+    with pytest.raises(InputError, match=r"a folder whose j\.jsonl is of an earlier run"):
+        Journal(tmp_path, "j.jsonl", "code")
+    assert (tmp_path / "j.jsonl").read_bytes() == content
+    (tmp_path / "j.jsonl").write_bytes(b'{"code": "code"}\n{"code": "co')
+    assert len(Journal(tmp_path, "j.jsonl", "code").rows) == 1
+
+
+def test_libraries_print_no_text_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "a.trc").write_bytes(b"\x1b[2J\x1b]0;title\x07\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "rig", "score", "a.trc", "--against", SESSIONS / "hammer-5.2.mcap"],
+        cwd=tmp_path, capture_output=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.count(b"\n"), b"\x1b" in done.stderr) == (2, 1, False)
+
+
+@pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)])
+def test_closed_streams_change_neither_status_nor_output(closed: tuple[int, ...], tmp_path: Path) -> None:
+    def close() -> None:
+        for number in closed:
+            os.close(number)
+
+    for arguments in (["info", "--quick"], ["cut", "-o", tmp_path / "a.mcap"]):
+        command = [sys.executable, "-m", "rig", arguments[0], SESSIONS / "hammer-5.2.mcap", *arguments[1:]]
+        done = subprocess.run(command, stderr=subprocess.PIPE, preexec_fn=close, check=False)
+        assert (done.returncode, done.stderr) == (0, b"")
+    assert Recording.open(tmp_path / "a.mcap").complete

@@ -16,6 +16,7 @@ _INTERNAL = "text that this program wrote, or holds already"
 EXCEPTIONS = {
     "rig/base/files.py": "the functions themselves",
     "rig/base/checks.py:read_json": "the function itself",
+    "rig/cli/main.py:_open_closed_streams": "the null device in place of closed streams",
     "rig/cli/commands/completion.py:_install": "the start file of the user's shell, which may be a link",
     "rig/cli/commands/completion.py:_remove": "the same",
     "rig/cli/commands/keys.py:_values": _INTERNAL,
@@ -42,7 +43,6 @@ EXCEPTIONS = {
     "replays/recordings/formats/readers/uff.py:__init__": _DRAFT,
     "replays/recordings/identification/document.py:write_set": "in a temporary folder",
     "replays/report/canvas.py": "the functions themselves",
-    "replays/studies/common/journal.py:_load": "lines that this program wrote; others have another code",
 }
 """Functions, or modules with all of their functions, that do it themselves, with the reason."""
 _ATTRIBUTES = frozenset({"write_text", "write_bytes", "savefig", "rename", "renames", "mkstemp", "NamedTemporaryFile"})

@@ -471,20 +471,26 @@ def test_device_and_limits_of_a_shipped_campaign_can_be_replaced(
     (found,) = case.devices
     assert (found.command, found.folder) == ("python mine.py {url} 0.15 2 mm", str(tmp_path))
     for name, device, limits, must in (
-        ("hammer", "python mine.py", [], "--device must be left out, as the campaign has 0 devices, not one"),
+        ("hammer", "python mine.py", [], "^--device must be left out, as the campaign has 0 devices, not one"),
         (
             "protection-trip",
             "python other.py",
             [],
-            "device.command must be a program with a script that exists in .*other.py",
+            "^--device must be a program with a script that exists in .*other.py",
         ),
         (
             "protection-trip",
             None,
             ["dely=1 ms"],
-            "--limit must be NAME=QUANTITY with a limit of the campaign, such as delay",
+            "^--limit must be NAME=QUANTITY with a limit of the campaign, such as delay",
         ),
-        ("protection-trip", None, ["delay"], "--limit delay must be a number with its unit"),
+        ("protection-trip", None, ["delay"], "^--limit delay must be a number with its unit"),
+        (
+            "protection-trip",
+            None,
+            ["delay=150 kg"],
+            "^--limit delay must be in a unit of time, as that of",
+        ),
     ):
         with pytest.raises(InputError, match=must):
             load_campaign(campaign_path(name), device, limits)

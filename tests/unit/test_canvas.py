@@ -8,6 +8,7 @@ import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -35,6 +36,14 @@ def test_same_drawing_gives_same_bytes(tmp_path: Path, suffix: str, head: bytes)
     assert files[0].read_bytes() == files[1].read_bytes()
     assert files[0].read_bytes().startswith(head)
     assert b"dc:date" not in files[0].read_bytes()
+
+
+@pytest.mark.filterwarnings("ignore:Glyph")
+def test_names_with_control_characters_are_readable_xml(tmp_path: Path) -> None:
+    figure = new_figure(2.0, "\x1b[2J\x07 \u202e<script>")
+    (file,) = save(figure, tmp_path / "a.svg")
+    texts = "".join(ElementTree.parse(file).getroot().itertext())
+    assert "\\x1b[2J\\x07 \\u202e<script>" in texts
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])

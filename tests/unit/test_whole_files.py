@@ -5,6 +5,7 @@ lost.
 from __future__ import annotations
 
 import os
+import socket
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,16 @@ import pytest
 
 from rig.base.checks import read_toml
 from rig.base.errors import DiskError, InputError
-from rig.base.files import check_new_file, check_output_differs, open_output, whole_file, write_file
+from rig.base.files import (
+    TextLines,
+    check_new_file,
+    check_output_differs,
+    open_file,
+    open_output,
+    read_file,
+    whole_file,
+    write_file,
+)
 from rig.cli.app import start
 from rig.run.scenes import load_scene, parse_scene
 from rig.serve.transport.exposure.certificates import create_keys, read_holder
@@ -42,12 +52,54 @@ def test_no_symbolic_link_is_followed(tmp_path: Path) -> None:
 
 
 def test_a_draft_has_another_name_each_time(tmp_path: Path) -> None:
+    write_file(tmp_path / "a.csv", "")
     with whole_file(tmp_path / "a.csv") as one, whole_file(tmp_path / "a.csv") as two:
         assert one != two
         assert one.stat().st_size == two.stat().st_size == 0
     for name in ("x" * 240, "盤" * 80):  # near the limit of 255 bytes
         with whole_file(tmp_path / f"{name}.csv") as draft:
             assert draft.exists()
+
+
+def test_a_file_that_appears_meanwhile_is_kept_and_so_is_the_output(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    with pytest.raises(DiskError, match="created by another process") as found, whole_file(path) as draft:  # noqa: PT012
+        draft.write_text("mine")
+        path.write_text("of another")
+    kept = Path(str(found.value).rpartition(" ")[2])
+    assert {each.name: each.read_text() for each in tmp_path.iterdir()} == {"a.csv": "of another", kept.name: "mine"}
+    assert kept.suffix == ".csv"
+
+
+def test_only_a_regular_file_is_replaced_and_a_link_only_if_asked(tmp_path: Path) -> None:
+    (tmp_path / "link.csv").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe.csv")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(os.path.relpath(tmp_path / "socket.csv"))
+    for force in (False, True):
+        for name in ("pipe.csv", "socket.csv"):
+            with pytest.raises(InputError, match="a file, not a pipe, socket or device"):
+                check_new_file(tmp_path / name, field="output", suffixes=(".csv",), force=force)
+    with pytest.raises(InputError, match="a new file"):
+        check_new_file(tmp_path / "link.csv", field="output", suffixes=(".csv",), force=False)
+    check_new_file(tmp_path / "link.csv", field="output", suffixes=(".csv",), force=True)
+
+
+def test_a_file_is_read_up_to_a_size_and_a_line_up_to_a_length(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"abc")
+    assert read_file(path, 3) == b"abc"
+    with pytest.raises(OSError, match="larger than"):
+        read_file(path, 2)
+    for size, count in ((100, 1), (10 << 20, 0)):
+        with path.open("wb") as file:
+            file.truncate(size)
+        with TextLines(open_file(path), "utf-8") as lines:
+            for _ in range(count):
+                assert len(next(lines)) == size
+            if not count:
+                with pytest.raises(ValueError, match="a line of more than"):
+                    list(lines)
 
 
 def test_a_fault_of_the_program_is_not_blamed_on_the_disk(tmp_path: Path) -> None:

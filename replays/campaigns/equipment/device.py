@@ -16,6 +16,7 @@ from replays.campaigns.equipment.process import Program
 from replays.campaigns.measurement import split_quantity
 from rig.base import units
 from rig.base.errors import InputError, such_as
+from rig.base.files import open_file
 from rig.serve.waiting import Deadline
 
 PLACEHOLDER = re.compile(r"\{\{|\}\}|\{(\w+)(?::([^{}]*))?\}|[{}]")
@@ -128,8 +129,8 @@ def hash_files(files: Iterable[Path]) -> dict[str, str]:
     """Return the SHA-256 digests of files by name, without those that cannot be read."""
     digests = {}
     for file in files:
-        with contextlib.suppress(OSError):
-            digests[file.name] = hashlib.sha256(file.read_bytes()).hexdigest()
+        with contextlib.suppress(OSError), open_file(file) as opened:
+            digests[file.name] = hashlib.file_digest(opened, "sha256").hexdigest()
     return digests
 
 

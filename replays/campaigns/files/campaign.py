@@ -23,10 +23,10 @@ from replays.campaigns.files.case_results import Time, Units
 from replays.campaigns.files.event_fields import check_event
 from replays.campaigns.files.expectation import KINDS, Expect, ExpectEvent, find_selectors
 from replays.campaigns.files.line_numbers import find_line, number_lines
-from replays.campaigns.measurement import split_quantity
-from rig.base.checks import Written, check, parse_toml
+from replays.campaigns.measurement import quantity, split_quantity
+from rig.base.checks import TOML_BYTES, Written, check, parse_toml
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.files import build_read_error, is_file, open_file
+from rig.base.files import build_read_error, is_file, read_file
 from rig.channels.faults import find_channels, find_group
 from rig.channels.faults.blocks import BlockFault
 from rig.physics.kernels import signals
@@ -210,8 +210,7 @@ def load_campaign(
         InputError: For the first error, with the file and line.
     """
     try:
-        with open_file(path) as file:
-            text = file.read().decode("utf-8-sig")
+        text = read_file(path, TOML_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(str(path), "a TOML file", Words("bytes that are not UTF-8")) from None
     except OSError as error:
@@ -223,7 +222,7 @@ def load_campaign(
         line = re.search(r"line (\d+)", place)
         where = f"{path}:{line[1] if line else text.count(chr(10)) + 1}"
         raise InputError(f"{where}: the text", "TOML", Words(problem)) from None
-    with _add_location(path, text):
+    with _add_location(path, text, {} if device is None else {"device.command": "--device"}):
         file = check(_File, document, field="")
         written = file
         if device is not None:
@@ -248,7 +247,10 @@ def _replace_limits(file: _File, limits: Sequence[str]) -> _File:
         known = {**file.limits, **file.matrix.limits}
         if name not in known:
             raise UnknownNameError("--limit", "NAME=QUANTITY with a limit of the campaign", name, known)
-        split_quantity(value, field=f"--limit {name}")
+        of_file = known[name]
+        first = of_file if isinstance(of_file, str) else of_file[0]
+        unit = split_quantity(first, field=f"limits.{name}")[1]
+        quantity(value, unit, field=f"--limit {name}", of=f"that of the file ({first})")
     matrix = {name: values for name, values in file.matrix.limits.items() if name not in new}
     return file.model_copy(
         update={"limits": {**file.limits, **new}, "matrix": file.matrix.model_copy(update={"limits": matrix})}
@@ -256,10 +258,13 @@ def _replace_limits(file: _File, limits: Sequence[str]) -> _File:
 
 
 @contextmanager
-def _add_location(path: Path, text: str) -> Iterator[None]:
+def _add_location(path: Path, text: str, options: Mapping[str, str]) -> Iterator[None]:
+    """Add file and line to errors of fields, except of those that an option of the command line replaces."""
     try:
         yield
     except InputError as error:
+        if (option := options.get(error.field, error.field)).startswith("--"):
+            raise InputError(option, error.must, error.received) from None
         lines = number_lines(text)
         line = find_line(error.field, lines) or 1
         field = re.sub(r"\.\d+(?=\.|$)", "", error.field)

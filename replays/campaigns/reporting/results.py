@@ -20,9 +20,9 @@ from pydantic import Field
 from replays.campaigns.equipment.cleanup import find_containment
 from replays.report import junit, write_report
 from replays.studies.common import provenance
-from rig.base.checks import StrictModel, check, read_json
+from rig.base.checks import DOCUMENT_BYTES, StrictModel, check, read_json
 from rig.base.errors import DiskError, InputError
-from rig.base.files import build_read_error, open_file, write_file
+from rig.base.files import build_read_error, read_file, write_file
 from rig.base.text import printable, replace_nonfinite
 
 if TYPE_CHECKING:
@@ -250,8 +250,7 @@ def load_results(folder: Path) -> dict[str, Any]:
     """
     path = folder if folder.suffix == ".json" else folder / "results.json"
     try:
-        with open_file(path) as file:
-            document = read_json(file.read(), field=str(path))
+        document = read_json(read_file(path, DOCUMENT_BYTES), field=str(path))
     except OSError as error:
         raise build_read_error(path, error) from None
     if document.get("format") != FORMAT:

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Field
 
 from rig.base.checks import DOCUMENT_BYTES, describe_error, load_extensions, read_json
 from rig.base.errors import InputError, RefusedError, Words
-from rig.base.files import build_read_error, open_file
+from rig.base.files import build_read_error, open_file, read_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -267,8 +267,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
 def _read_sidecar(path: Path) -> dict[str, str]:
     """Return the rig's documents from FILE.json, where `rig export` writes them for formats without metadata."""
     try:
-        with open_file(path.with_name(path.name + ".json")) as file:
-            attached = read_json(file.read(DOCUMENT_BYTES + 1)).get("documents")
+        attached = read_json(read_file(path.with_name(path.name + ".json"), DOCUMENT_BYTES)).get("documents")
     except (OSError, InputError):  # missing, or written by another program
         return {}
     documents = attached if isinstance(attached, dict) else {}

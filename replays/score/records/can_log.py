@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import struct
 import zlib
@@ -14,13 +13,16 @@ from typing import Any
 import numpy as np
 
 from replays.score.records.recorded import Pieces, Recorded, RecordedTable
+from rig.base.checks import describe_error
 from rig.base.errors import InputError, Words
-from rig.base.files import build_read_error, inflate, open_file
+from rig.base.files import TextLines, build_read_error, inflate, open_file
 from rig.channels.table import ChannelTable
 
 _SUFFIXES = (".log", ".asc", ".blf", ".trc")
 _BLF_HEAD, _BLF_OBJECT = struct.Struct("<4sI"), struct.Struct("<4sHHII")
 _BLF_CONTAINER, _ZLIB = struct.Struct("<HH12x"), 2
+_MAX_OBJECT = 64 << 20
+"""Largest object of a BLF file [bytes]; containers have about 128 kB."""
 _ENDLESS = re.compile(rb"LOBJ.{4}\0{4}", re.DOTALL)
 """Object of size 0, after which python-can would read the same one again and again."""
 
@@ -50,21 +52,22 @@ def _open_reader(path: Path, file: BufferedReader) -> Any:
         file.seek(0)
         return can.BLFReader(file)
     readers: dict[str, Any] = {".log": can.CanutilsLogReader, ".asc": can.ASCReader, ".trc": can.TRCReader}
-    return readers[path.suffix.lower()](io.TextIOWrapper(file, "utf-8", errors="replace"))
+    return readers[path.suffix.lower()](TextLines(file, "utf-8", errors="replace"))
 
 
 def _find_containers(file: BufferedReader) -> Iterator[bytes]:
     """Yield the data of all containers of a BLF file, compressed by zlib.
 
     Raises:
-        ValueError: An object is smaller than its header; python-can would take the rest of the file for its data.
+        ValueError: An object is smaller than its header, and python-can would take the rest of the file for its data,
+            or it would fill the memory.
     """
     _, length = _BLF_HEAD.unpack(file.read(_BLF_HEAD.size))
     file.seek(length)
     while len(head := file.read(_BLF_OBJECT.size)) == _BLF_OBJECT.size:
         _, _, _, size, kind = _BLF_OBJECT.unpack(head)
-        if size < _BLF_OBJECT.size:
-            raise ValueError("object too small")
+        if not _BLF_OBJECT.size <= size <= _MAX_OBJECT:
+            raise ValueError(f"an object of {size} bytes")
         data = file.read(size - _BLF_OBJECT.size)
         file.read(size % 4)
         if kind == 10 and len(data) > _BLF_CONTAINER.size:
@@ -104,7 +107,7 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
         raise
     except Exception as error:  # whatever python-can raises on a log that it cannot read
         reason = build_read_error(path, error) if isinstance(error, OSError) else None
-        raise reason or InputError("FILE", "an intact CAN log", Words(f"{path} ({type(error).__name__})")) from None
+        raise reason or InputError("FILE", "an intact CAN log", Words(f"{path} ({describe_error(error)})")) from None
     fd = any(messages.by_name[name].fd for name in frames)
     signals = []
     for name, (data, stamps) in frames.items():

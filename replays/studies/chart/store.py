@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 import platform
 from pathlib import Path
@@ -13,7 +12,7 @@ import rig
 from replays.studies.common import provenance
 from replays.studies.common.journal import Journal
 from rig.base.errors import InputError
-from rig.base.files import open_file
+from rig.base.files import TextLines, open_file
 
 KEY = ("mode", "panel", "phase", "case", "method", "rung")
 """Columns that identify a point."""
@@ -111,7 +110,7 @@ def read_table(folder: Path) -> list[Row]:
     """
     path = folder / "chart.csv"
     try:
-        with io.TextIOWrapper(open_file(path), encoding="utf-8", newline="") as file:
+        with TextLines(open_file(path), encoding="utf-8", newline="") as file:
             return [
                 {key: row[key] if key in _TEXT else float(value) if (value := row[key]) else None for key in COLUMNS}
                 for row in ({**dict.fromkeys(_OPTIONAL_COLUMNS), **row} for row in csv.DictReader(file))

@@ -23,7 +23,7 @@ from replays.studies.peers.common.problem import ERROR_COLUMNS, Problem
 from replays.studies.peers.common.reference import Reference
 from replays.studies.peers.common.solution import Solution
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.files import build_read_error, open_file, write_file
+from rig.base.files import build_read_error, read_file, write_file
 from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import STATE
 
@@ -118,8 +118,7 @@ def read_submission(path: Path) -> Submission:
         InputError: If the file cannot be read, or a key, a column or a row is missing or wrong.
     """
     try:
-        with open_file(path) as file:
-            lines = file.read(_MAX_BYTES).decode("utf-8-sig", "replace").splitlines()
+        lines = read_file(path, _MAX_BYTES).decode("utf-8-sig", "replace").splitlines()
     except OSError as error:
         raise build_read_error(path, error) from None
     comments = [line[1:].partition(":") for line in lines if line.startswith("#")]

@@ -7,8 +7,12 @@ import os
 from pathlib import Path
 from typing import Any
 
+from rig.base.checks import read_json
 from rig.base.errors import InputError, Words
-from rig.base.files import open_file, open_output, write_file
+from rig.base.files import open_output, read_file, write_file
+
+_MAX_BYTES = 1 << 28
+"""Largest journal that is continued [bytes]."""
 
 
 def prepare_folder(folder: Path) -> None:
@@ -57,12 +61,16 @@ class Journal:
             self._load(code)
 
     def _load(self, code: str) -> None:
-        with open_file(self.path) as file:
-            text = file.read().decode()
-        if text and not text.endswith("\n"):  # an incomplete last line of a killed run
-            text = text[: text.rfind("\n") + 1]
-            write_file(self.path, text)
-        lines = [json.loads(line) for line in text.splitlines()]
+        try:
+            text, _, incomplete = read_file(self.path, _MAX_BYTES).decode().rpartition("\n")
+            lines = [read_json(line.encode(), field="line") for line in text.splitlines()]
+            if not "{".startswith(incomplete[:1]):
+                raise InputError("last line", "a JSON object", incomplete[:60])
+        except (ValueError, OSError) as error:
+            must = f"a folder whose {self.path.name} is of an earlier run"
+            raise InputError("--output", must, Words(f"another file ({error})")) from None
+        if incomplete:  # the last line of a killed run
+            write_file(self.path, text + "\n" * bool(text))
         self.rows = [line for line in lines if line.get("code") == code]
         self.outdated = len(lines) - len(self.rows)
 

@@ -7,8 +7,9 @@ import re
 import tomllib
 from pathlib import Path
 
+from rig.base.checks import TOML_BYTES
 from rig.base.errors import InputError, Words
-from rig.base.files import open_file, write_file
+from rig.base.files import read_file, write_file
 from rig.run.model_choice import Pick
 from rig.run.scenes import Scene, load_scene, pick_digests, scene_path
 
@@ -37,8 +38,7 @@ def write_pick(path: Path, scene_name: str, pick: Pick) -> None:
         InputError: If the file cannot be edited safely.
     """
     source = path if path.is_file() else scene_path(scene_name)
-    with open_file(source) as file:
-        old = file.read().decode()  # with its line endings
+    old = read_file(source, TOML_BYTES).decode()  # with its line endings
     new = with_pick(old, pick)
     write_file(path.resolve(), new)  # a link to the scene is kept
 

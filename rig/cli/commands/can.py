@@ -13,7 +13,7 @@ import typer
 from rig.base.errors import InputError
 from rig.base.files import check_new_file, write_file
 from rig.cli.connections.can_output import CanMessages, bit_rates
-from rig.cli.options import ChannelFile
+from rig.cli.options import ChannelFile, Force
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import Form, echo, echo_document, echo_json, new_table
 from rig.cli.signals import stop_on_signals
@@ -100,13 +100,14 @@ def dbc(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE.dbc", help="Write the DBC to this file")
     ] = None,
+    force: Force = False,
     channels: ChannelFile = None,
 ) -> None:
     """Show the DBC of the rig's messages, generated from the channel table, or write it to a file."""
     from drivers.can.dbc import text
 
     if output is not None:
-        check_new_file(output, field="--output", suffixes=(".dbc",), force=True)
+        check_new_file(output, field="--output", suffixes=(".dbc",), force=force)
     schedule, speed = CanMessages(can_classic=True).plan(_table(channels))
     _warn(schedule, speed)
     if output is None:

@@ -151,4 +151,4 @@ def remove(
     from rig.serve.transport.exposure.certificates import remove_holder
 
     remove_holder(folder, name)
-    echo(f"{name}: withdrawn, and {folder / name} removed. A running rig denies it after a restart.")
+    echo(f"{name}: withdrawn, and {folder / name} removed. A running rig still admits it until a restart.")

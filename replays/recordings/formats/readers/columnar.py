@@ -33,8 +33,10 @@ def look_into(path: Path, options: FileOptions) -> Source:
     from pyarrow import parquet
 
     file = parquet.ParquetFile(path, buffer_size=1 << 20)
-    if 8 * file.metadata.num_rows > find_data_limit(path.stat().st_size):
-        raise ValueError(f"{file.metadata.num_rows} rows")
+    about, limit = file.metadata, find_data_limit(path.stat().st_size)
+    declared = sum(about.row_group(group).total_byte_size for group in range(about.num_row_groups))
+    if max(8 * about.num_rows * about.num_columns, declared) > limit:
+        raise ValueError(f"{about.num_rows} rows of {about.num_columns} columns, more than {limit >> 20} MB")
     schema = file.schema_arrow
     headings = [parse_heading(field.name) for field in schema]
     names = [name for name, _ in headings]

@@ -16,7 +16,7 @@ from replays.recordings.formats.readers.dialect import MISSING, Layout, find_lay
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, read_error
 from replays.recordings.resimulation.background import Background
 from rig.base.errors import InputError, Words
-from rig.base.files import open_file
+from rig.base.files import TextLines, open_file
 from rig.base.text import printable
 
 _BLOCK_BYTES = 1 << 21
@@ -105,7 +105,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
 
 def _first_fields(path: Path, layout: Layout) -> list[str]:
-    with io.TextIOWrapper(open_file(path), layout.encoding) as file:
+    with TextLines(open_file(path), layout.encoding) as file:
         return layout.dialect.fields([file.readline() for _ in range(layout.first + 1)][layout.first])
 
 

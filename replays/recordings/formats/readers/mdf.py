@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import mmap
+import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -39,6 +39,8 @@ _SYNC_NONE, _SYNC_TIME = 0, 1
 """Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
 _PIECE = 1 << 22
 """Bytes of records read at a time."""
+_SCAN_BYTES, _MAX_BLOCK_BYTES = 1 << 20, 1 << 28
+"""Bytes that are searched for blocks at a time, and most bytes of a block that are measured."""
 _HEAD, _FLAGS = 64, 4
 """Size of the first block, and of the flags at its end that mark an unfinished file, in MDF4."""
 _MASTER, _REMOTE_MASTER = 2, 8
@@ -112,12 +114,16 @@ def _documents(mdf: Any) -> dict[str, str]:
 
 def _find_compressed_blocks(path: Path) -> Iterator[bytes]:
     """Yield the data of all blocks that are compressed by zlib."""
-    with open_file(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for kind, header in ((b"##DZ", 48), (b"##AT", 96)):  # the size is the last field of both headers
-            begin = -1
-            while (begin := data.find(kind, begin + 1)) >= 0:
-                first = begin + header
-                yield data[first : first + int.from_bytes(data[first - 8 : first], "little")]
+    # Read by parts, not mapped: a mapped file that another process truncates would end this process.
+    with open_file(path) as file:
+        number, begin = file.fileno(), 0
+        with suppress(OSError):  # at the last data of the file; its holes are skipped
+            while len(part := os.pread(number, _SCAN_BYTES, begin := os.lseek(number, begin, os.SEEK_DATA))) > 3:
+                for found in re.finditer(b"##(DZ|AT)", part):
+                    first = begin + found.start() + (48 if found[1] == b"DZ" else 96)
+                    size = int.from_bytes(os.pread(number, 8, first - 8), "little")  # the last field of both headers
+                    yield os.pread(number, min(size, _MAX_BLOCK_BYTES), first)
+                begin += len(part) - 3
 
 
 def _open(path: Path) -> Any:

@@ -13,6 +13,7 @@ from replays.recordings.formats.exporting import export
 from replays.recordings.formats.source import Entry, FileSignal, Source, load_library
 from rig.base.checks import DOCUMENT_BYTES, check
 from rig.base.errors import InputError, Words
+from rig.base.files import read_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.selection import ExportChunk, ExportTable, Selection
@@ -94,7 +95,7 @@ def _read_sidecar(path: Path, channels: int) -> tuple[tuple[_Column, ...], float
     beside = path.with_name(path.name + ".json")
     if not beside.is_file():
         return (_Column(),) * channels, 0.0, None
-    sidecar = check(_Sidecar, beside.read_bytes(), field=beside.name, most_bytes=DOCUMENT_BYTES)
+    sidecar = check(_Sidecar, read_file(beside, DOCUMENT_BYTES), field=beside.name, most_bytes=DOCUMENT_BYTES)
     table = sidecar.tables[0]
     if len(table.columns) != channels:
         raise InputError(beside.name, f"of a file with {channels} channels", len(table.columns))

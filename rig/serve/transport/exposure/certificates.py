@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rig.base.errors import InputError, Words
-from rig.base.files import write_file
+from rig.base.files import read_file, write_file
 from rig.serve.transport.exposure.access import DEVICE_NAME, ROLE_NAMES, ROLES, WITH_TRUTH, get_device
 
 if TYPE_CHECKING:
@@ -35,6 +35,8 @@ HOLDERS = (SERVER, *ROLES)
 _AUTHORITY, _CERTIFICATE, _KEY = _FILES = ("authority.pem", "certificate.pem", "key.pem")
 _ALLOWED = "allowed.txt"
 """File in the rig's folder: the common names that it admits, one a line."""
+_MAX_BYTES = 1 << 20
+"""Largest file of a certificate, a key or a list [bytes]."""
 _NAME = re.compile(rf"({'|'.join(ROLES)})({re.escape(WITH_TRUTH)})?(@{DEVICE_NAME}\.[0-9a-f]{{8}})?")
 """Common name of a client's certificate: the number distinguishes it from a withdrawn one of the same device."""
 _SKEW = timedelta(hours=1)
@@ -123,7 +125,7 @@ def read_holder(folder: Path | str, *, server: bool) -> Holder:
     kind = "the rig" if server else f"one role ({', '.join(ROLES)})"
     must = f"a folder with the keys of {kind}, as made by: rig keys init"
     try:
-        certificate = x509.load_pem_x509_certificate((holder_folder / _CERTIFICATE).read_bytes())
+        certificate = x509.load_pem_x509_certificate(read_file(holder_folder / _CERTIFICATE, _MAX_BYTES))
         usage = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
         name = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
         is_complete = all((holder_folder / file).is_file() for file in (_AUTHORITY, _KEY))
@@ -147,7 +149,7 @@ def _read_allowed(server: Path) -> list[str]:
     """Return the common names that a rig admits; without a list, those of all roles."""
     if not (server / _ALLOWED).exists():
         return list(ROLE_NAMES)
-    names = (server / _ALLOWED).read_text(encoding="utf-8", errors="replace").split()
+    names = read_file(server / _ALLOWED, _MAX_BYTES).decode(errors="replace").split()
     if wrong := [name for name in names if not _NAME.fullmatch(name)]:
         raise InputError(str(server / _ALLOWED), "a list of certificates' names", wrong[0])
     return names
@@ -259,8 +261,8 @@ def add_device(folder: Path, device: str, role: str, *, truth: bool = False, day
     if not re.fullmatch(DEVICE_NAME, device) or device in (*HOLDERS, AUTHORITY) or (folder / device).exists():
         raise InputError("NAME", "a new name of letters, digits and hyphens, not that of a role or a folder", device)
     try:
-        authority = x509.load_pem_x509_certificate((folder / AUTHORITY / _CERTIFICATE).read_bytes())
-        signing: Any = load_pem_private_key((folder / AUTHORITY / _KEY).read_bytes(), None)
+        authority = x509.load_pem_x509_certificate(read_file(folder / AUTHORITY / _CERTIFICATE, _MAX_BYTES))
+        signing: Any = load_pem_private_key(read_file(folder / AUTHORITY / _KEY, _MAX_BYTES), None)
     except (OSError, ValueError, TypeError):
         raise InputError("DIR", "a folder made by: rig keys init --keep-authority", str(folder)) from None
     valid = min(timedelta(days=days), authority.not_valid_after_utc - datetime.now(UTC))
