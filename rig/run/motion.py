@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,10 @@ from rig.run.scenes import Initial
 STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy")
 SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
 DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
+WATCHED_S = 0.25
+"""Time over which the kind of motion is determined [s]: three revolutions of the shaft in backward whirl at 1 Hz."""
+_CONTACT_SHARE = 0.95
+"""Share of rows in contact from which the contact counts as lasting; losses of a few rows are waviness of the force."""
 BRANCH_ALARM = 1e-2
 """Energy residual over dissipated energy above which a run may have missed a contact or added a false one."""
 
@@ -73,6 +78,44 @@ def initial_state(model: Model, initial: Initial, begin: MotionStart | None, *, 
     if math.hypot(x, y) > contact.clearance:
         raise InputError("initial.position", inside(contact.clearance * 1e3), [initial.x_mm, initial.y_mm])
     return model.state(ring_x=x, ring_y=y, spin=spin)
+
+
+class MotionWatch:
+    """Kind of the shaft's motion in the ring, from the rows of the last `WATCHED_S`."""
+
+    def __init__(self, row_rate_hz: float) -> None:
+        """Start without rows."""
+        self._row_rate_hz = row_rate_hz
+        self._blocks: deque[tuple[int, int, int, float]] = deque()
+        self._last = False, 0.0
+
+    def add(self, rows: np.ndarray) -> None:
+        """Add the rows of a block, shape (n, N_ROW)."""
+        touching = rows[:, COLUMN["penetration"]] > 0.0
+        contact, angle = self._last
+        turned, starts = 0.0, 0
+        if touching.any() or contact:
+            angles = np.unwrap([angle, *np.arctan2(rows[:, COLUMN["ring_y"]], rows[:, COLUMN["ring_x"]])])
+            turned, angle = float(angles[-1] - angles[0]), float(angles[-1])
+            starts = int(np.count_nonzero(touching & ~np.append(contact, touching[:-1])))
+        self._last = bool(touching[-1]), angle
+        self._blocks.append((len(rows), int(np.count_nonzero(touching)), starts, turned))
+        while sum(count for count, *_ in self._blocks) - self._blocks[0][0] >= WATCHED_S * self._row_rate_hz:
+            self._blocks.popleft()
+
+    def document(self) -> dict[str, Any] | None:
+        """Return kind of motion, whirl frequency [Hz, forward positive] and impacts per second; None at the start."""
+        if not self._blocks:
+            return None
+        rows, touching, starts, turned = (sum(each) for each in zip(*self._blocks, strict=True))
+        seconds = rows / self._row_rate_hz
+        kind, frequency_hz = "free" if not touching else "impacts", None
+        if touching >= _CONTACT_SHARE * rows:
+            frequency_hz = turned / (2.0 * math.pi) / seconds
+            kind = "backward whirl" if frequency_hz < 0.0 else "forward whirl"
+            if abs(turned) < math.pi:
+                kind, frequency_hz = "resting", None
+        return {"kind": kind, "whirl_hz": frequency_hz, "impacts_hz": starts / seconds if kind == "impacts" else None}
 
 
 @dataclass

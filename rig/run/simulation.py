@@ -37,7 +37,7 @@ from rig.run import calibrator
 from rig.run.commands.command import SceneCommand
 from rig.run.commands.table import check_command
 from rig.run.fault_injection import FaultInjector
-from rig.run.motion import BRANCH_ALARM, Motion, MotionStart, energy_balance, initial_state
+from rig.run.motion import BRANCH_ALARM, Motion, MotionStart, MotionWatch, energy_balance, initial_state
 from rig.run.scenes import Scene, load_scene, scene_document
 from rig.run.speed_target import Segment, segments
 
@@ -53,7 +53,7 @@ class Snapshot:
 
 
 _STATE_FIELDS = (
-    "tick", "first_row", "_segments", "inputs", "pending", "_motion", "_companion", "_accuracy", "_last",
+    "tick", "first_row", "_segments", "inputs", "pending", "_motion", "_companion", "_accuracy", "_last", "_watch",
     "_conditioners", "_keyphasor", "_edge_count", "faults",
 )  # fmt: skip
 
@@ -164,6 +164,7 @@ class Simulation:
         self._accuracy = Accuracy(choice.tolerance, clearance, block_s, limits)
         self._rows = np.full((0, S.N_ROW), np.nan)
         self._last: np.ndarray | None = None
+        self._watch = MotionWatch(TICK_RATE_HZ / self.row_ticks)
 
     def __repr__(self) -> str:
         return f"Simulation({self.scene.name}: at {self.tick / self.tick_rate_hz:g} of {self.scene.duration_s:g} s)"
@@ -229,6 +230,7 @@ class Simulation:
                 done = row
         rows = rows[:n]
         self._last = rows[-1].copy()
+        self._watch.add(rows)
         if not all(map(math.isfinite, self._motion.y.tolist())):
             at_s = self._find_divergence_s(rows, start)
             raise SimulationError(f"the state is no longer finite at {at_s:.6f} s; {self._method.advice}")
@@ -329,6 +331,7 @@ class Simulation:
             },
             "accuracy": None if self._companion is None else accuracy.document(),
             "engine": {**choice, "levels": self.scene.model.model_dump()},
+            "motion": self._watch.document(),
             "contacts": int(memory[CONTACTS]),
             "peak_normal_force_n": float(memory[PEAK_FORCE]),
             "steps": int(memory[STEPS]),

@@ -15,7 +15,7 @@ from rig.serve.request_handler import PendingCommand, RequestHandler, one_line
 from rig.serve.transport import Server
 
 _SUMMARY_FIGURES = (
-    "scene", "pace", "tick", "time_s", "real_time_factor", "lateness_ms", "overruns", "queue", "congestion",
+    "scene", "pace", "tick", "time_s", "motion", "real_time_factor", "lateness_ms", "overruns", "queue", "congestion",
     "samples_published", "commands", "replay",
 )  # fmt: skip
 """Values of the last status that the summary contains."""
@@ -136,6 +136,7 @@ class ServedRun(ABC):
                 "congestion": self._server.congestion(),
                 "clients": self._handler.clients.rows(self.published, rate_hz),
                 "spin_hz": health.get("spin_hz"),
+                "motion": health.get("motion"),
                 "energy": health.get("energy", {}),
                 "engine": health.get("engine", {}),
                 "accuracy": health.get("accuracy"),

@@ -11,7 +11,7 @@ from rig.base.errors import InputError
 from rig.cli.connections.can_output import CanOptions
 from rig.cli.connections.connection import Serving, serve
 from rig.cli.options import SceneChanges, SceneName
-from rig.cli.output.display import lateness_summary, lateness_text
+from rig.cli.output.display import lateness_summary, lateness_text, motion_text
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import echo
 
@@ -98,13 +98,16 @@ def status_parts(status: dict[str, Any]) -> list[str]:
     spin = [] if spin_hz is None else [f"spin {spin_hz:.2f} Hz"]
     waits = [text] if (text := describe_waits(status["devices"])) else []
     pace = f"x{status['real_time_factor']:.4f} real time"
-    return [f"{status['time_s']:7.2f}{end} s", *waits, *spin, pace, lateness_text(status)]
+    motion = [motion_text(status["motion"])] if status.get("motion") else []
+    return [f"{status['time_s']:7.2f}{end} s", *waits, *spin, *motion, pace, lateness_text(status)]
 
 
 def _print_summary(summary: dict[str, Any]) -> None:
     queue = summary["queue"]
     echo(f"scene {summary['scene']}: {summary['reason']} at {summary['time_s']:.3f} s after {summary['wall_s']:.2f} s")
     late = lateness_summary(summary)
+    if summary.get("motion"):
+        echo(f"motion at the end: {motion_text(summary['motion'])}")
     echo(f"real-time factor {summary['real_time_factor']:.6f}, {late}, overruns {summary['overruns']}")
     echo(
         f"{summary['samples_published']} samples per channel published, blocks dropped {queue['dropped']},"

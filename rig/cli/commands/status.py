@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.connections.connection import Connection
-from rig.cli.output.display import accuracy_text, engine_text, number_text
+from rig.cli.output.display import accuracy_text, engine_text, motion_text, number_text
 from rig.cli.output.tables import Form, Table, echo_json, fact_table, make_printable, new_table
 
 if TYPE_CHECKING:
@@ -119,6 +119,8 @@ def status_table(document: dict[str, Any]) -> Table:
     else:
         rows.append(("read ahead", f"{queue['depth']} instants"))
     rows.append(("spin", number_text(document["spin_hz"], "Hz")))
+    if motion := document.get("motion"):
+        rows.append(("motion", motion_text(motion)))
     if energy:  # test signals and recordings have none
         residual, dissipated = number_text(energy.get("residual_j"), "J"), number_text(energy.get("dissipated_j"), "J")
         rows.append(("energy", f"residual {residual}, dissipated {dissipated}"))

@@ -109,6 +109,15 @@ def accuracy_text(accuracy: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
+def motion_text(motion: dict[str, Any]) -> str:
+    """Return the kind of the shaft's motion in words."""
+    if (frequency_hz := motion.get("whirl_hz")) is not None:
+        return f"{motion.get('kind')} at {abs(frequency_hz):.1f} Hz"
+    if (impacts_hz := motion.get("impacts_hz")) is not None:
+        return f"impacts, {impacts_hz:.0f} per second"
+    return str(motion.get("kind"))
+
+
 def number_text(value: float | None, unit: str, *, digits: int = 4) -> str:
     """Return a number of a status with its unit."""
     return f"{value:.{digits}g} {unit}" if isinstance(value, float | int) else "not finite"
