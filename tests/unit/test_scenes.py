@@ -7,13 +7,17 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.base.errors import InputError
+from rig.channels.orbit import synchronous
 from rig.channels.table import default_table
+from rig.physics.parameters import load_parameters
 from rig.run.commands.table import COMMANDS, HammerCommand, ReleaseCommand, SpeedCommand, check_command
+from rig.run.offline import simulate
 from rig.run.scenes import Scene, load_scene, parse_scene, read_value, scene_document, scene_names
 
 PERIODS = [n for n in range(1, 10_001) if 1_000_000 % n == 0]
@@ -330,3 +334,47 @@ def test_scenes_are_frozen() -> None:
     with pytest.raises(ValueError, match="frozen"):
         scene.seed = 2
     assert Scene() == Scene()
+
+
+def test_the_scenes_of_the_critical_speed_pass_it_without_contact() -> None:
+    # Slower than 5 Hz and faster than 13 Hz the shaft moves little: the middle of each run has the resonance.
+    for name, start_s, end_s in (("critical-speed", 0.0, 20.0), ("coast-down", 10.0, 30.0)):
+        scene = load_scene(name)
+        assert {round(speed_hz) for _, speed_hz in scene.drive.profile} == {1, 15}
+        profile = dict(scene.drive.profile)
+        middle = [[0.0, np.interp(start_s, [*profile], [*profile.values()])]]
+        middle += [[end_s - start_s, np.interp(end_s, [*profile], [*profile.values()])]]
+        changes = {"drive.profile": middle, "duration_s": end_s - start_s, "sensors.rate_hz": 1000}
+        run = simulate(name, changes, signals=["normal_force"])
+        speed_hz, vector = synchronous(run.samples["disk_x"], run.samples.times_s, run.edges_s)
+        assert run["normal_force"].max() == 0.0
+        assert 0.4 < abs(vector).max() < 0.65  # [mm]; at rest e / (2 zeta) = 0.62 mm
+        assert 9.1 < speed_hz[abs(vector).argmax()] < 10.1  # mode at 9.57 Hz; later the faster the speed changes
+
+
+def test_slow_roll_shows_the_run_out_of_its_table() -> None:
+    run = simulate("slow-roll", duration_s=6.0, signals=[])
+    for channel, phase in (("disk_x", 0.9), ("disk_y", 0.9 - math.pi / 2)):
+        _, vector = synchronous(run.samples[channel], run.samples.times_s, run.edges_s)
+        expected = 0.025 * np.exp(1j * phase)
+        assert abs(vector[1:-1].mean() - expected) < 0.0015  # and a little of the unbalance
+
+
+def test_the_hammer_test_at_rest_stays_free_and_shows_both_modes() -> None:
+    run = simulate("hammer-shaft", signals=["normal_force", "disk_x", "disk_y"])
+    assert run["normal_force"].max() == 0.0
+    for channel in ("disk_x", "disk_y"):
+        spectrum = abs(np.fft.rfft(run[channel]))
+        assert 9.0 < spectrum[1:].argmax() / 48.0 < 11.0
+    assert [event["event"] for event in run.events] == ["hammer"] * 6
+
+
+def test_the_hammer_test_of_the_houses_rings_at_the_mode_of_both_on_the_transducers() -> None:
+    run = simulate("hammer-house", signals=["normal_force"])
+    parameters = load_parameters()
+    inner, outer = parameters["house.inner_mass"], parameters["house.outer_mass"]
+    both_hz = math.sqrt(parameters["house.pair_stiffness_vertical"] * (1 / inner + 1 / outer)) / (2 * math.pi)
+    late = run.times_s > 1.5
+    spectrum = abs(np.fft.rfft(run.samples["inner_y"][late]))
+    found_hz = spectrum[1:].argmax() / 0.5
+    assert both_hz < found_hz < 1.06 * both_hz  # stiffer by the beams and the contact with the shaft

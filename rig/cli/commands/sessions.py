@@ -22,9 +22,9 @@ def sessions(
     ] = None,
     force: Force = False,
 ) -> None:
-    """List the reference sessions, small recordings installed with the rig, or record them again.
+    """List or record again the reference sessions, small recordings that are installed with the rig.
 
-    With -o, their quantities are also written as text, for review as a diff.
+    With -o, they are recorded again, and their quantities are written as text, for review as a diff.
     """
     from replays.sessions import FOLDER, SESSIONS, make
 
