@@ -68,7 +68,8 @@ def list_pictures(signals: Signals, kinds: Sequence[str] = ()) -> dict[str, Call
             each = {group: {"channels": names} for group, names in groups.items()}
         elif pairs and (option := {"pair", "channels"} & signature(function).parameters.keys()):
             each = {
-                pair: dict.fromkeys(option, pair) for pair in (signals.pairs if kind == "frequency_response" else pairs)
+                pair: dict.fromkeys(option, pair)
+                for pair in (signals.pairs if kind in ("frequency_response", "modes") else pairs)
             }
         for name, options in each.items() if kind in (kinds or KINDS) else ():
             pictures[re.sub(r"[^\w.-]+", "_", f"{kind}-{name}").rstrip("-")] = partial(function, signals, **options)

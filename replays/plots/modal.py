@@ -33,6 +33,8 @@ _FIT_ROUNDS, _ROWS_PER_PERIOD, _MAX_BLOCKS = 20, 8, 600
 """Steps of a fit; rows per period at the frequency limit, and rows of a decay."""
 _MAX_DAMPING, _MAX_ERROR, _MIN_AMPLITUDE = 0.5, 0.1, 0.05
 """Largest damping ratio of a mode, half interval of its frequency, relative, and amplitude relative to the largest."""
+_MAX_REMAINING = 0.7
+"""RMS of the last fifth of a window relative to the first above which an oscillation does not decay."""
 _MIN_COHERENCE = 0.5
 """Coherence below which a phase is noise."""
 
@@ -63,16 +65,25 @@ class Hits(NamedTuple):
     def describe(self) -> str:
         """Return number, direction and window of the hits in words."""
         count, window_s = len(self.times_s), self.force.shape[1] / self.samples.rate_hz
-        angle = "" if self.direction in ("", "x", "y") else "°"
+        angle = "" if self.direction.strip("-xy and") == "" else "°"
         along = f" along {self.direction}{angle}" if self.direction else ""
         lost = f", {self.dropped} left out for a gap" if self.dropped else ""
         return f"{count} hit{'s' * (count > 1)}{along}, windows of {window_s:.3g} s{lost}"
 
 
-def read_hits(signals: Signals, channels: Sequence[str] | str, window_s: float | None, direction: Any) -> Hits:
-    """Return the hits of one direction and the responses of channels to them.
+def read_hits(
+    signals: Signals, channels: Sequence[str] | str, window_s: float | None, direction: Any, axis: str = ""
+) -> Hits:
+    """Return hits and the responses of channels to them.
 
     The force is that of the channel `hammer`, else the half sines of the events of hammer pulses.
+
+    Args:
+        signals: The data.
+        channels: Channels or pairs; none for the first pair.
+        window_s: Length of the window of each hit [s]; None for the shortest time to the next hit or the end.
+        direction: Direction of the hits; None for those along the axis.
+        axis: x or y; hits of the first direction if there are none along it; empty for all hits.
 
     Raises:
         InputError: There is no hit with a whole window, or an argument is invalid.
@@ -104,16 +115,16 @@ def read_hits(signals: Signals, channels: Sequence[str] | str, window_s: float |
         next((str(each["direction"]) for each in pulses if abs(each["time_s"] - at_s) < _EVENT_S), "")
         for at_s in starts_s
     ]
-    wanted = labels[0] if direction is None else str(direction)
-    if wanted not in labels:
+    wanted = next((each for each in labels if each.lstrip("-") == axis), labels[0])
+    if direction is not None and (wanted := str(direction)) not in labels:
         raise UnknownNameError("direction", "that of a hit", wanted, labels)
+    chosen = [at for at, label in enumerate(labels) if label == wanted or (direction is None and not axis)]
     longest_s = float(min([*np.diff(starts_s), times_s[-1] - starts_s[-1]]))
     if window_s is not None and not 0.0 < window_s <= longest_s:
         raise InputError("window_s", f"above 0, and at most {longest_s:.4g} between hits and to the end", window_s)
     rows = int((longest_s if window_s is None else window_s) * rate_hz)
     # The window begins ahead of the hit by the foot of its pulse.
     ahead = [end - begin for begin, end in runs]
-    chosen = [at for at, label in enumerate(labels) if label == wanted]
     whole = [
         at for at in chosen
         if runs[at][0] >= ahead[at] and runs[at][0] - ahead[at] + rows <= len(samples)
@@ -128,6 +139,7 @@ def read_hits(signals: Signals, channels: Sequence[str] | str, window_s: float |
     pulse = np.where(np.arange(rows) < after[:, None], force[places], 0.0)
     responses = samples.values[places][:, :, : len(names)]
     dropped = len(chosen) - len(whole)
+    wanted = " and ".join(dict.fromkeys(labels[at] for at in chosen))
     return Hits(unit, wanted, starts_s[whole], pulse, responses, after, samples.select(*names), dropped)
 
 
@@ -146,7 +158,7 @@ def frequency_response(
     Args:
         signals: The data.
         channels: Channels or pairs, such as `disk` or `inner`; none for the first pair.
-        direction: Direction of the hits that are averaged; None for that of the first.
+        direction: Direction of the hits that are averaged; None for those along each probe, or else the first.
         window_s: Length of the window of each hit [s]; None for the shortest time to the next hit or the end.
         max_hz: Largest frequency [Hz]; None for that at which the force's power falls to 1 % of its largest.
         axes: Axes to draw on: amplitudes of all channels, then phases, then coherences; None for a new figure.
@@ -158,8 +170,11 @@ def frequency_response(
     Raises:
         InputError: There is no hit.
     """
-    hits = read_hits(signals, channels, window_s, direction)
-    rows, names, rate_hz = hits.force.shape[1], hits.samples.names, hits.samples.rate_hz
+    names = signals.list_channels(channels)
+    axis_of = {name: "y" if abs(signals.get_direction_deg(name) - 90.0) < 45.0 else "x" for name in names}
+    by_axis = {axis: read_hits(signals, names, window_s, direction, axis) for axis in dict.fromkeys(axis_of.values())}
+    hits = by_axis[axis_of[names[0]]]
+    rows, rate_hz = hits.force.shape[1], hits.samples.rate_hz
     frequency, power, _, _ = window_spectra(hits.force, hits.force, rate_hz)
     if max_hz is None:
         weak = np.flatnonzero(power[1:] < _MIN_POWER * power.max())
@@ -167,12 +182,10 @@ def frequency_response(
     shown = (frequency > 0.0) & (frequency <= max_hz)
     if not shown.any():
         raise InputError("max_hz", f"at least {frequency[1]:g}, one line of the window", max_hz)
-    one, count = len(hits.times_s) == 1, len(names)
-    whole, end = np.ptp(hits.responses, axis=1).max(axis=0), hits.responses[:, -max(2, rows // 20) :]
-    remaining = np.ptp(end, axis=1).max(axis=0) / np.maximum(whole, 1e-300)
+    count = len(names)
     note = (
-        f"{hits.describe()}, without taper; phase: lead of the response"
-        + f"; phases of coherence below {_MIN_COHERENCE:g} left out" * (len(hits.times_s) > 1)
+        f"{' and '.join(dict.fromkeys(each.describe() for each in by_axis.values()))}, without taper; phase: lead of "
+        "the response" + f"; phases of coherence below {_MIN_COHERENCE:g} left out" * (len(hits.times_s) > 1)
     )
     title = describe_title(signals, "Frequency response to hammer hits")
     panels = make_axes(
@@ -180,10 +193,14 @@ def frequency_response(
     )  # fmt: skip
     columns: dict[str, tuple[str, np.ndarray]] = {"frequency": ("Hz", frequency[shown])}
     for column, name in enumerate(names):
-        unit = hits.samples.units[column]
-        own, cross = (each[shown] for each in window_spectra(hits.force, hits.responses[:, :, column], rate_hz)[2:])
-        estimates = {"H1": cross / power[shown], "H2": own / np.conj(cross)}
-        coherence = np.abs(cross) ** 2 / (power[shown] * own) * (math.nan if one else 1.0)
+        hits = by_axis[axis_of[name]]
+        unit, response, one = hits.samples.units[column], hits.responses[:, :, column], len(hits.times_s) == 1
+        remaining = np.ptp(response[:, -max(2, rows // 20) :], axis=1).max() / max(
+            np.ptp(response, axis=1).max(), 1e-300
+        )
+        power, own, cross = (each[shown] for each in window_spectra(hits.force, response, rate_hz)[1:])
+        estimates = {"H1": cross / power, "H2": own / np.conj(cross)}
+        coherence = np.abs(cross) ** 2 / (power * own) * (math.nan if one else 1.0)
         ratio = f"({unit})/{hits.unit}" if "/" in unit else f"{unit}/{hits.unit}"
         amplitude, phase, bottom = panels[column::count]
         for (label, values), colour, line in zip(estimates.items(), (BLUE, ORANGE), ("-", "--"), strict=True):
@@ -198,7 +215,7 @@ def frequency_response(
         if one:
             text = "one hit: coherence is 1\nby construction, not shown"
             bottom.text(0.5, 0.5, text, transform=bottom.transAxes, ha="center", va="center", fontsize=9)
-        text = f"range at the end of the window: {remaining[column]:.1%}"
+        text = f"range at the end of the window: {remaining:.1%}"
         amplitude.set_title(text, loc="right", fontsize=8, fontweight="normal", color="0.35")
         amplitude.set(title=name, ylabel=axis_label("amplitude", ratio))
         phase.set(ylabel="phase [°]" if column == 0 else "", ylim=(-190, 190), yticks=range(-180, 181, 90))
@@ -337,7 +354,7 @@ def modes(
     Args:
         signals: The data.
         channels: Channels or pairs; none for the first pair.
-        direction: Direction of the hits; None for that of the first.
+        direction: Direction of the hits; None for all.
         window_s: Length of the window of each hit [s]; None for the shortest time to the next hit or the end.
         max_hz: Frequency that the fit must resolve [Hz]; None for four times that of the largest response.
         axes: Axes to draw on: decays of all channels, then damping ratio over frequency; None for a new figure.
@@ -361,6 +378,12 @@ def modes(
         np.stack([block_means(column[after:], block) for column in response.T], axis=1)[:_MAX_BLOCKS]
         for response, after in zip(hits.responses, hits.after, strict=True)
     ]
+    fifth = max(1, len(decays[0]) // 5)
+    first, last_fifth = (
+        np.std(np.stack([each[part] for each in decays]), axis=(0, 1)) for part in (slice(fifth), slice(-fifth, None))
+    )
+    if np.all(last_fifth > _MAX_REMAINING * first):
+        raise InputError("modes", "drawn of oscillations that decay after a hit", Words("some that do not"))
     # Channels of a unit have the same weight, so that a response that is small does not count as much as a large one.
     spreads, units = np.std(np.concatenate(decays), axis=0), np.array(hits.samples.units)
     scale = np.array([spreads[units == unit].max() or 1.0 for unit in units])

@@ -78,6 +78,29 @@ def test_events_of_hits_replace_a_hammer_channel() -> None:
         frequency_response(signals, direction="y")
 
 
+def test_each_probe_has_the_hits_along_it_and_modes_have_all() -> None:
+    along = dict(zip(HITS_S, ("x", "y", "-y"), strict=True))
+    events = [
+        {"event": "hammer", "time_s": at_s, "force_n": 60.0, "duration_ms": 5.0, "direction": direction}
+        for at_s, direction in along.items()
+    ]
+    signals = replace(read_signals(build_hits()), events=lambda: events)
+    _, table = frequency_response(signals)
+    check_response(table)
+    assert table.note.startswith("1 hit along x, windows of 2.2 s and 1 hit along y, windows of 2.2 s, without")
+    noisy = replace(read_signals(build_hits(noise=0.005)), events=lambda: events)
+    assert "3 hits along x and y and -y, windows" in modes(noisy).table.note
+    assert "1 hit along -y" in frequency_response(signals, direction="-y").table.note
+
+
+def test_an_oscillation_that_does_not_decay_has_no_modes() -> None:
+    samples = build_hits()
+    whirl = 3.0 * np.exp(-2j * math.pi * 12.0 * samples.times_s)
+    values = samples.values + np.stack([whirl.real, whirl.imag, 0.0 * whirl.real], axis=1)
+    with pytest.raises(InputError, match=r"modes must be drawn of oscillations that decay .*; received some that do n"):
+        modes(replace(samples, values=values))
+
+
 def test_noise_lowers_the_coherence_and_one_hit_has_none() -> None:
     table = frequency_response(build_hits(noise=0.02)).table
     near = np.abs(table["frequency"] - 9.5) < 2.0
@@ -115,15 +138,16 @@ def test_intervals_of_modes_cover_the_truth() -> None:
     turn = 2.0 * math.pi * hz
     decay = np.exp((-ratio + 1j * math.sqrt(1.0 - ratio**2)) * turn * time_s)
     inside = np.zeros(2)
-    for seed in range(200):
+    for seed in range(100):
         rng = np.random.default_rng(seed)
         values = np.real(np.exp(1j * rng.uniform(0.0, 6.0)) * decay) + 0.05 * rng.normal(size=len(decay)) + 0.3
         found = fit_modes([values[:, None]], 1.0 / 80.0, [np.empty((len(values), 0))])
         at = int(np.argmin(np.abs(found.frequency_hz[:, 0] - hz)))
         for side, (estimate, truth) in enumerate(((found.frequency_hz[at], hz), (found.damping[at], ratio))):
             inside[side] += abs(estimate[0] - truth) <= estimate[1]
-    assert (inside >= 180).all(), inside
-    assert (inside <= 196).all(), inside
+    # 95 % of 100: 89 to 99 with a probability of 98 %; the seeds are fixed.
+    assert (inside >= 89).all(), inside
+    assert (inside <= 99).all(), inside
 
 
 def test_each_pair_has_a_frequency_response_also_of_accelerometers() -> None:
@@ -131,6 +155,7 @@ def test_each_pair_has_a_frequency_response_also_of_accelerometers() -> None:
     names, units = ("disk_x", "inner_x", "inner_y", "disk_y", "hammer"), ("mm", "m/s^2", "m/s^2", "mm", "N")
     both = replace(samples, values=samples.values[:, [0, 0, 1, 1, 2]], names=names, units=units)
     pictures = list_pictures(read_signals(both), ["frequency_response", "modes"])
-    assert list(pictures) == ["frequency_response-disk", "frequency_response-inner", "modes-disk"]
+    kinds = ("frequency_response", "modes")
+    assert list(pictures) == [f"{kind}-{pair}" for kind in kinds for pair in ("disk", "inner")]
     table = pictures["frequency_response-inner"]().table
     assert table.units[table.names.index("inner_x H1")] == "(m/s^2)/N"

@@ -40,20 +40,22 @@ def plot(
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
     signals = read_signals(recording, from_s=from_s, to_s=to_s)
     pictures, written, reasons = list_pictures(signals, split_names(only)), list[Path](), list[str]()
+    last: InputError | None = None
     with reporting() as reporter:
         reporter.begin(len(pictures))
         for name, draw in pictures.items():
             try:
                 drawn = draw()
             except InputError as error:
-                if only:
-                    raise
+                last = error
                 reasons.append(f"{name}: left out: {error}")
             else:
                 output.mkdir(exist_ok=True)
                 path = output / f"{name}{'.svg' if svg else '.png'}"
                 written += drawn.save(path, table=".parquet" if parquet else ".csv", source=str(recording.path))
             reporter.step(name)
+    if only and last is not None and not written:
+        raise last
     for path in written:
         echo(path)
     for line in reasons:
