@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
+from replays.plots.spectra import full_spectrum, waterfall
 from replays.recordings.verdict import hammer_time_s
 from replays.recordings.whirl import parameter_si, reactions, whirl_figures
 from replays.report.canvas import BLACK, BLUE, GREEN, RED, draw_signals, house_style, new_figure, save
-from rig.channels.orbit import SPECTRUM_HZ, full_spectrum, waterfall
+from rig.channels.orbit import SPECTRUM_HZ
 
 _BEFORE, _IMPACTS, _WHIRL = GREEN, RED, BLUE
 _X, _Y = BLUE, RED
-_FREQUENCY = "frequency [Hz]\n← backward      forward →"
 
 
 @house_style()
@@ -67,22 +67,17 @@ def draw(recording: Recording, path: Path) -> None:
         _draw_pair(ax, forces.times_s, pairs, window, ("E − W", "N − S"))
         ax.set(title=title, ylabel="force [N]")
 
-    ax = axes[2, 1]
-    kept = probes.times_s >= end_s - 2.0
-    frequency, amplitude = full_spectrum(disk[0][kept], disk[1][kept], probes.rate_hz)
-    near = np.abs(frequency) <= SPECTRUM_HZ
-    ax.axvline(figures.law_hz, color=RED, ls=":", lw=1.4, label=f"−Ω Rₛ/(r₀ + δ)\n= −{abs(figures.law_hz):.1f} Hz")
-    ax.semilogy(frequency[near], np.maximum(amplitude[near], 1e-5), color=BLUE, lw=0.9)
-    ax.set(title="Full spectrum, settled whirl", xlabel=_FREQUENCY, ylabel="amplitude [mm]", ylim=(1e-5, 10.0))
-    ax.legend(loc="upper right")
-
-    ax = axes[2, 2]
-    times, frequency, amplitude = waterfall(*disk, probes.rate_hz, probes.times_s)
-    level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
-    mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
-    figure.colorbar(mesh, ax=ax, label="level [dB re 1 µm]", pad=0.02)
-    ax.axhline(hammer_s, color="w", lw=0.9, ls=":")
-    ax.set(title="Full-spectrum waterfall", xlabel=_FREQUENCY, ylabel="time [s]")
+    (panel,), _ = full_spectrum(recording, pair="disk", last_s=2.0, max_hz=SPECTRUM_HZ, axes=axes[2, 1])
+    for text in list(panel.texts):
+        text.remove()  # the law has its place
+    law = panel.axvline(
+        figures.law_hz, color=RED, ls="--", lw=1.4, label=f"−Ω Rₛ/(r₀ + δ) = −{abs(figures.law_hz):.1f} Hz"
+    )
+    panel.set(title="Full spectrum, settled whirl", ylim=(panel.get_ylim()[0], 100.0))
+    panel.legend(handles=[law], loc="upper right")
+    waterfall(recording, pair="disk", max_hz=SPECTRUM_HZ, window_s=0.2, axes=axes[2, 2])
+    axes[2, 2].axhline(hammer_s, color="w", lw=0.9, ls=":")
+    axes[2, 2].set(title="Full-spectrum waterfall")
     save(figure, path)
 
 
