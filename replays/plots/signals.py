@@ -306,7 +306,8 @@ def measure_runout(source: Any, *, orders: int = 1, max_hz: float | None = None,
     """
     signals = read_signals(source, **options)
     edges_s, vectors = signals.require_edges("run-out"), dict[str, np.ndarray]()
-    for name in [name for pair in signals.require_pairs().values() for name in pair]:
+    probes = [name for pair in signals.require_pairs().values() for name in pair]
+    for name in [name for name in probes if signals.is_length(name)] or probes:
         samples = signals.read(name)
         turns, fitted = fit_orders(samples, samples.values, edges_s, tuple(range(1, orders + 1)))
         slow = np.diff(edges_s)[turns] >= (0.0 if max_hz is None else 1.0 / max_hz)

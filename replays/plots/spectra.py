@@ -16,6 +16,9 @@ from rig.channels.orbit import waterfall as compute_waterfall
 
 _SPECTRUM_S = 2.0
 """Length of the end of the data that a full spectrum shows by default [s]; its lines are 0.5 Hz apart."""
+_PADDING, _MAX_PADDED = 8, 1 << 19
+"""Lines per sample of a full spectrum, and most samples for so many. With one line per sample the peak of a frequency
+between two lines is up to 15 % too low, with eight 0.3 %; a long record has lines close to any frequency of a rotor."""
 _MAX_SPECTRA = 200
 """Largest number of spectra in a picture, about one per three pixels."""
 _CASCADE_LINES, _CASCADE_PEAK = 40, 6.0
@@ -45,7 +48,9 @@ def full_spectrum(signals: Signals, *, pair: str | None = None, max_hz: float | 
     probes, edges_s = signals.read_pair(pair), signals.edges_s
     piece = max(find_pieces(probes.samples), key=lambda each: each.stop - each.start)
     times_s = probes.samples.times_s[piece]
-    frequency, amplitude = compute_spectrum(probes.x[piece], probes.y[piece], probes.samples.rate_hz)
+    x, y = probes.x[piece], probes.y[piece]
+    lines = _PADDING * len(x) if len(x) <= _MAX_PADDED else None
+    frequency, amplitude = compute_spectrum(x, y, probes.samples.rate_hz, lines=lines)
     frequency, amplitude = _limit(frequency, amplitude, max_hz, SPECTRUM_HZ)
     note = f"{describe_frame(signals)}; Hann window, {times_s[0]:.3f} to {times_s[-1]:.3f} s"
     title = describe_title(signals, f"Full spectrum at {probes.name}")

@@ -15,8 +15,12 @@ from recorder.reader import Recording
 from replays.plots.methods import KINDS
 from replays.plots.plot import Plot
 from replays.plots.signals import find_pieces, measure_runout, read_signals
+from replays.recordings.export import write_run
 from rig.base.errors import InputError
 from rig.base.samples import Samples
+from rig.run.offline import simulate
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 RATE_HZ = 5000.0
 SPEED_HZ = 7.0
@@ -325,6 +329,18 @@ def test_spectra_show_a_known_chirp() -> None:
     assert not ((gap["time"] > empty[0]) & (gap["time"] < empty[1])).any()
 
 
+def test_the_peak_of_a_frequency_between_two_lines_has_its_amplitude() -> None:
+    for hz in (20.25, 40.13, -61.4):  # lines of 2 s are 0.5 Hz apart
+        turn = 2.0 * math.pi * hz
+        samples = build_samples(
+            3.0, speed_hz=(2.0, 12.0), disk_x=lambda t, _, turn=turn: 1.5 * np.cos(turn * t),
+            disk_y=lambda t, _, turn=turn: 1.5 * np.sin(turn * t),
+        )  # fmt: skip
+        table = samples.plot.full_spectrum().table
+        assert table["amplitude"].max() == pytest.approx(1.5, rel=0.004)
+        assert table["frequency"][table["amplitude"].argmax()] == pytest.approx(hz, abs=0.04)
+
+
 def test_full_spectrum_and_cascade_separate_forward_and_backward() -> None:
     def build(sign: float) -> Any:
         function = np.cos if sign > 0.0 else np.sin
@@ -393,6 +409,16 @@ def test_the_command_draws_each_pair_and_group(
     assert {path.name for path in (tmp_path / "few").iterdir()} == {
         f"orbit-{pair}.{suffix}" for pair in ("disk", "ring") for suffix in ("png", "parquet")
     }
+
+
+def test_the_command_subtracts_the_run_out_of_a_slow_roll(tmp_path: Path) -> None:
+    slow, fast = tmp_path / "slow.mcap", tmp_path / "fast.mcap"
+    write_run(Simulation(load_scene("slow-roll", {"duration_s": 3.5})), slow)
+    write_run(Simulation(load_scene("slow-roll", {"duration_s": 1.0, "drive.speed_hz": 6.0})), fast)
+    assert rig_plot(fast, "-o", tmp_path, "--only", "orbit", "--run-out", slow) == 0
+    orbit = np.genfromtxt(tmp_path / "orbit-disk.csv", delimiter=",", skip_header=1)
+    clean = simulate("slow-roll", {"drive.speed_hz": 6.0}, duration_s=1.0, signals=["disk_x"])["disk_x"]
+    assert np.std(orbit[:, 1] - 1e3 * clean) < 0.004  # [mm]; the run-out has 0.019
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,9 @@ from rig.cli.output.folder import check_folder
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import echo
 
+_RUNOUT_ORDERS = 32
+"""Components of the run-out waveform per revolution: dents of a twentieth of the circumference."""
+
 
 def plot(
     files: RecordingFiles,
@@ -22,6 +25,9 @@ def plot(
     only: Annotated[str | None, typer.Option(metavar="orbit,bode", help="Draw only these kinds of plots")] = None,
     from_s: FromS = None,
     to_s: ToS = None,
+    runout: Annotated[
+        Path | None, typer.Option("--run-out", metavar="FILE", help="Subtract the run-out of this slow-roll recording")
+    ] = None,
     svg: Annotated[bool, typer.Option("--svg", help="Write pictures as SVG, not PNG")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Write tables as Parquet, not CSV")] = False,
 ) -> None:
@@ -33,12 +39,13 @@ def plot(
     """
     from recorder.reader import join
     from replays.plots.methods import list_pictures
-    from replays.plots.signals import read_signals
+    from replays.plots.signals import measure_runout, read_signals
 
     check_folder(output, field="--output")
     bounds = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
-    signals = read_signals(recording, from_s=from_s, to_s=to_s)
+    waveform = None if runout is None else measure_runout(join([runout]), orders=_RUNOUT_ORDERS)
+    signals = read_signals(recording, from_s=from_s, to_s=to_s, runout=waveform)
     pictures, written, reasons = list_pictures(signals, split_names(only)), list[Path](), list[str]()
     last: InputError | None = None
     with reporting() as reporter:
