@@ -26,6 +26,7 @@ def known():
 simulation = Simulation("hammer")
 simulation.warm_up()
 before = known()
+simulation.submit("fault", {"channel": "probes", "kind": "hum", "amplitude_v": 0.1})
 while simulation.tick < 500_000:
     frame = simulation.advance(simulation.block_ticks)
 assert simulation.health()["engine"]["rolling_share"] > 0.3, "no whirl, which calls much for the first time"

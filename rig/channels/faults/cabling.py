@@ -95,7 +95,8 @@ class Volts:
     def signals(self, names: Sequence[str]) -> np.ndarray:
         """Return the signals [SI] equivalent to the inputs of the converters' filters, shape (rows, channels)."""
         about, plugs = self._scales, connect_swaps(self._active)
-        volts = self._conditioned[:, [about.places[plugs.get(name, name)] for name in names]]
+        # In C order, for which the filters are compiled; an index of columns would give the other.
+        volts = np.take(self._conditioned, [about.places[plugs.get(name, name)] for name in names], axis=1)
         for one in self._active:
             if acts(one.what, "volts"):
                 for name in one.names:
