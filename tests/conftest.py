@@ -1,10 +1,10 @@
 """Distribution of tests over workers (`-n`), and fixtures that many tests share.
 
-Tests that read the clock or start processes wait most of their time. Modules marked in this way form two queues, each
-processed by one worker. Tests within a process come first; tests that run an engine or start real rigs follow, when
-that engine is compiled. A second worker compiles all engines one after another, because two that compile at the same
-time would both compile the shared parts. A third worker runs the tools and other modules that need no engine until the
-default engine is compiled. All other modules follow, the longest first.
+Tests that read the clock or start processes wait most of their time. Modules marked in this way form three queues, each
+processed by one worker. Tests within a process come first; the pages of the docs, and the tests that run an engine or
+start real rigs, follow, when that engine is compiled. A second worker compiles all engines one after another, because
+two that compile at the same time would both compile the shared parts. A third worker runs the tools and other modules
+that need no engine until the default engine is compiled. All other modules follow, the longest first.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ if SHIPPED_TABLE not in os.environ:
     table.TABLE = ROOT / "tests/channels.toml"
 COMPILING = "tests/parity/test_compiling.py"
 TOOLS = "tests/house/test_tools.py"
+PAGES = "tests/system/test_pages.py"
 WITHOUT_ENGINE = (
     "tests/unit/test_laws_command.py",
     "tests/unit/test_magnets_command.py",
@@ -39,12 +40,12 @@ WITHOUT_ENGINE = (
     "tests/house/test_sizes.py",
     "tests/house/test_contracts.py",
     "tests/unit/test_score_track.py",
-    "tests/unit/test_score.py",
 )
 """Modules that run no engine, for as long as the default engine compiles (75 s of processor time). A rig or a test that
 runs an engine during this time would compile it as well, and take 40 s of processor time for it."""
 LONG_MODULES = (
     "tests/unit/test_nuisance.py",
+    "tests/unit/test_score.py",
     "tests/unit/test_score_faults.py",
     "tests/unit/test_paper.py",
     "tests/unit/test_blind_faults.py",
@@ -87,11 +88,13 @@ def _queue(module: str) -> str | None:
     path = ROOT / module
     if not path.is_file() or _CLOCK.search(text := path.read_text(encoding="utf-8")) is None:
         return None
+    if module == PAGES:
+        return "pages"
     return "rigs" if module.startswith("tests/system/") or _ENGINE.search(text) else "clock"
 
 
 def _place(nodeid: str) -> tuple[int, int]:
-    """Return the position of a test: waiting tests, engines, tests without engine, rigs, long tests, all others."""
+    """Return the position of a test: clock, engines, tests without engine, pages, rigs, long tests, all others."""
     module = _module(nodeid)
     if _queue(module) == "clock":
         return 0, 0
@@ -101,8 +104,8 @@ def _place(nodeid: str) -> tuple[int, int]:
         return 2, 0
     if module in WITHOUT_ENGINE:
         return 3, WITHOUT_ENGINE.index(module)
-    if _queue(module) == "rigs":
-        return 4, 0
+    if (queue := _queue(module)) is not None:
+        return 4, int(queue == "rigs")
     if module in LONG_MODULES:
         return 5, LONG_MODULES.index(module)
     return 6, 0

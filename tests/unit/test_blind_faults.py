@@ -61,9 +61,9 @@ def is_named_right(explanations: list[Explanation], channel: str, kind: str) -> 
 def test_a_fault_has_its_name(kind: str, numbers: dict[str, Any], tmp_path: Path) -> None:
     channel = BLIND_SIZES[kind][0]
     pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0, "duration_ms": 5.0, "direction": "x"}
-    lasts_s = 0.4 if channel == "keyphasor" else 0.2  # one pulse per turn
+    # There is one pulse per turn, and one spike in 25 ms.
+    lasts_s, duration_s = (0.4, 0.6) if channel == "keyphasor" else (0.2, 0.3) if kind == "spikes" else (0.1, 0.18)
     fault = {"at_s": 0.05, "command": "fault", "channel": channel, "kind": kind, "for_s": lasts_s, **numbers}
-    duration_s = 0.6 if channel == "keyphasor" else 0.3
     recording = recorded(
         tmp_path / "a.mcap", "hammer", duration_s=duration_s, drive__speed_hz=12.0, commands=[pulse, fault]
     )
@@ -75,7 +75,6 @@ def test_a_fault_has_its_name(kind: str, numbers: dict[str, Any], tmp_path: Path
     unit = unit_of(defect, default_table().channels[channel].unit)
     if size is not None and (what, explanations[0].unit) == (defect, unit) and channel != "keyphasor":
         assert explanations[0].value == pytest.approx(size, rel=0.5 if kind in RANDOM else 0.05)
-    # There is one pulse per turn; samples are immediate.
     assert explanations[0].from_s == pytest.approx(0.05, abs=0.2 if channel == "keyphasor" or kind in RANDOM else 0.03)
 
 

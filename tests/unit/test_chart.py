@@ -275,7 +275,7 @@ def test_a_small_chart_resumes_and_lists_missing_points(tmp_path: Path, monkeypa
             panels=["exact"],
             only="first-impacts",
             peers=False,
-            end_s=0.03,
+            end_s=0.02,
             methods=["rk4"],
             **changes,
         )
