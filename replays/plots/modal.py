@@ -199,8 +199,9 @@ def frequency_response(
             np.ptp(response, axis=1).max(), 1e-300
         )
         power, own, cross = (each[shown] for each in window_spectra(hits.force, response, rate_hz)[1:])
-        estimates = {"H1": cross / power, "H2": own / np.conj(cross)}
-        coherence = np.abs(cross) ** 2 / (power * own) * (math.nan if one else 1.0)
+        with np.errstate(invalid="ignore", divide="ignore"):  # a channel of zeros has no H2 and no coherence
+            estimates = {"H1": cross / power, "H2": own / np.conj(cross)}
+            coherence = np.abs(cross) ** 2 / (power * own) * (math.nan if one else 1.0)
         ratio = f"({unit})/{hits.unit}" if "/" in unit else f"{unit}/{hits.unit}"
         amplitude, phase, bottom = panels[column::count]
         for (label, values), colour, line in zip(estimates.items(), (BLUE, ORANGE), ("-", "--"), strict=True):
@@ -382,7 +383,7 @@ def modes(
     first, last_fifth = (
         np.std(np.stack([each[part] for each in decays]), axis=(0, 1)) for part in (slice(fifth), slice(-fifth, None))
     )
-    if np.all(last_fifth > _MAX_REMAINING * first):
+    if np.all(last_fifth >= _MAX_REMAINING * first):  # also without any response
         raise InputError("modes", "drawn of oscillations that decay after a hit", Words("some that do not"))
     # Channels of a unit have the same weight, so that a response that is small does not count as much as a large one.
     spreads, units = np.std(np.concatenate(decays), axis=0), np.array(hits.samples.units)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from replays.plots.signals import Pair, Signals, read_signals
+from replays.plots.signals import Pair, Signals, check_options, read_signals
 from replays.report.canvas import house_style, new_figure, png, save
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.files import whole_file, write_file
@@ -131,10 +131,11 @@ def kind(*, last_s: float | None = None) -> Callable[[Callable[..., Plot]], Call
         known = [*list(own.parameters)[1:], *common]
 
         @wraps(function)
-        def draw(source: Any, **options: Any) -> Plot:
+        def draw(source: Any, /, **options: Any) -> Plot:
             for name in options:
                 if name not in known:
                     raise UnknownNameError(f"option of {function.__name__}", "one that it has", name, known)
+            check_options(**options)
             chosen = {name: options.pop(name) for name in common if name in options}
             if "last_s" not in chosen and not {"from_s", "to_s"} & chosen.keys():
                 chosen["last_s"] = last_s
@@ -177,6 +178,8 @@ def make_axes(
         axes = list(np.ravel(np.asarray(given, dtype=object)))
         if len(axes) != rows * columns:
             raise InputError("axes", f"{rows * columns} axes", Words(f"{len(axes)}"))
+        if not all(hasattr(each, "plot") for each in axes):
+            raise InputError("axes", "matplotlib axes", Words(type(axes[0]).__name__))
         return axes
     figure = new_figure(height, title)
     figure.supxlabel(note, x=0.01, ha="left", fontsize=8, color="0.35")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -77,6 +77,58 @@ class Runout:
         """Return the run-out of a channel at angles from the keyphasor's passage [rad], shape (n,)."""
         waves = [np.real(vector * np.exp(1j * k * angle)) for k, vector in enumerate(self.vectors[channel], 1)]
         return np.sum(waves, axis=0)
+
+
+def _is_number(value: Any, low: float = -math.inf) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(value >= low)
+
+
+def _is_whole(value: Any, low: int, high: float) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(low <= value <= high)
+
+
+def _is_list(value: Any, valid: Callable[[Any], bool]) -> bool:
+    return isinstance(value, Iterable) and all(map(valid, value))
+
+
+_RULES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
+    **dict.fromkeys(("from_s", "to_s"), ("a number", _is_number)),
+    **dict.fromkeys(
+        ("last_s", "max_hz", "window_s", "max_order", "max_speed_hz"),
+        ("a number greater than 0", lambda value: _is_number(value, 1e-300)),
+    ),
+    "clearance": ("a number of at least 0", lambda value: _is_number(value, 0.0)),
+    "turns": ("a whole number of at least 1", lambda value: _is_whole(value, 1, math.inf)),
+    "orders": (
+        "a list of whole numbers from 1 to 100",
+        lambda value: _is_list(value, lambda one: _is_whole(one, 1, 100)) and len(value) > 0,
+    ),
+    **dict.fromkeys(
+        ("channels", "components"),
+        ("a name or a list", lambda value: _is_list(value, lambda one: isinstance(one, str))),
+    ),
+    "pair": ("a name", lambda value: isinstance(value, str)),
+    "runout": ("a run-out, of measure_runout", lambda value: isinstance(value, Runout)),
+    "probe_angles_deg": (
+        "two directions in degrees",
+        lambda value: _is_list(value, lambda one: _is_number(one, -1e6)) and len(value) == 2,
+    ),
+}
+"""What an option must be, and a function that returns whether a value is."""
+_REQUIRED = ("orders", "turns", "probe_angles_deg")
+"""Options that cannot be None."""
+
+
+def check_options(**options: Any) -> None:
+    """Check the types and ranges of options of plots.
+
+    Raises:
+        InputError: A value is invalid.
+    """
+    for name, value in options.items():
+        must, valid = _RULES.get(name, ("", lambda _: True))
+        if not valid(value) and (value is not None or name in _REQUIRED):
+            raise InputError(name, must, " ".join(f"{value}".split()) if isinstance(value, np.ndarray) else value)
 
 
 @dataclass(frozen=True)
@@ -304,6 +356,9 @@ def measure_runout(source: Any, *, orders: int = 1, max_hz: float | None = None,
     Raises:
         InputError: There is no such revolution, or no probe.
     """
+    if not _is_whole(orders, 1, math.inf):
+        raise InputError("orders", "a whole number of at least 1", orders)
+    check_options(max_hz=max_hz)
     signals = read_signals(source, **options)
     edges_s, vectors = signals.require_edges("run-out"), dict[str, np.ndarray]()
     probes = [name for pair in signals.require_pairs().values() for name in pair]
@@ -340,6 +395,7 @@ def read_signals(
     Raises:
         InputError: The source is of another kind, or has no rows in this interval.
     """
+    check_options(from_s=from_s, to_s=to_s, last_s=last_s, runout=runout, probe_angles_deg=probe_angles_deg)
     if isinstance(source, Signals):
         signals = source
     elif isinstance(source, Columns):
@@ -351,8 +407,6 @@ def read_signals(
     else:
         raise InputError("source", "a run, a recording or samples", Words(type(source).__name__))
     begin, end = signals.span_s
-    if last_s is not None and not last_s > 0.0:
-        raise InputError("last_s", "greater than 0", last_s)
     first, last = begin if from_s is None else max(begin, from_s), end if to_s is None else min(end, to_s)
     if not last > first:
         raise InputError("from_s and to_s", f"within {begin:g} to {end:g} s", Words(f"{from_s} to {to_s}"))

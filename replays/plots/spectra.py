@@ -29,6 +29,8 @@ _MIN_SHOWN = 0.01
 """Amplitude, relative to the largest, up to whose frequency spectra are drawn by default."""
 _DYNAMIC_RANGE = 1e-4
 """Smallest amplitude in a picture, relative to the largest."""
+_SCALE_FLOOR = 1e-30
+"""Smallest amplitude for a scale; a channel of zeros has one as well."""
 _SIDES = "frequency [Hz]\n← backward      forward →"
 
 
@@ -60,12 +62,12 @@ def full_spectrum(signals: Signals, *, pair: str | None = None, max_hz: float | 
         for side in (-1.0, 1.0):
             panel.axvline(side * speed_hz, color=RED, ls=":", lw=1.0, label="±1X" if side > 0.0 else "")
         panel.legend(loc="upper right")
-    highest, top = max(float(amplitude.max()), 1e-300), int(np.argmax(amplitude))
-    panel.semilogy(frequency, np.maximum(amplitude, _DYNAMIC_RANGE * highest), color=BLUE, lw=0.9)
+    highest, top = max(float(amplitude.max()), _SCALE_FLOOR), int(np.argmax(amplitude))
+    panel.set(yscale="log", ylim=(_DYNAMIC_RANGE * highest, 3.0 * highest))
+    panel.plot(frequency, np.maximum(amplitude, _DYNAMIC_RANGE * highest), color=BLUE, lw=0.9)
     label = f"{highest:.3g} {probes.unit} at {frequency[top]:.2f} Hz".replace("-", "−")
     panel.annotate(label, (frequency[top], highest), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=9)
-    limits = (_DYNAMIC_RANGE * highest, 3.0 * highest)
-    panel.set(xlabel=_SIDES, ylabel=axis_label("amplitude", probes.unit), xlim=frequency[[0, -1]], ylim=limits)
+    panel.set(xlabel=_SIDES, ylabel=axis_label("amplitude", probes.unit), xlim=frequency[[0, -1]])
     return Plot((panel,), Table.from_columns(note, frequency=("Hz", frequency), amplitude=(probes.unit, amplitude)))
 
 
@@ -137,15 +139,13 @@ def orders(
         even = first + turns * np.arange(count) / count
         x, y = CubicSpline(angle, np.stack([probes.x, probes.y], axis=1)[begin:end])(even).T
         order, amplitude = compute_spectrum(x, y, count / turns)
-        shown = np.abs(order) <= (max_order or _MAX_ORDER)
-        found.append((edges_s[first : first + turns + 1].mean(), order[shown], amplitude[shown]))
+        found.append((edges_s[first : first + turns + 1].mean(), order, amplitude))
     if not found:
         raise InputError("turns", "at most the number of revolutions without a gap", turns)
-    times_s, order, amplitude = (
-        np.array([each[0] for each in found]),
-        found[0][1],
-        np.array([each[2] for each in found]),
-    )
+    # The number of samples, and with it the highest order, differs between slow and fast revolutions.
+    highest = 1e-9 + min(max_order or _MAX_ORDER, *(order.max() for _, order, _ in found))
+    times_s, order = np.array([at_s for at_s, _, _ in found]), found[0][1][np.abs(found[0][1]) <= highest]
+    amplitude = np.array([each[np.abs(lines) <= highest] for _, lines, each in found])
     order, amplitude = _limit(order, amplitude, max_order, _MAX_ORDER)
     note = f"{describe_frame(signals)}; resampled at equal angles by the keyphasor, Hann windows of {turns} revolutions"
     title = describe_title(signals, f"Order spectra at {probes.name}")
@@ -229,9 +229,13 @@ def _limit(
     if limit is None:
         largest = np.nanmax(amplitude.reshape(-1, len(frequency)), axis=0, initial=0.0)
         limit = min(
-            most, 1.5 * np.abs(frequency[largest >= _MIN_SHOWN * largest.max()]).max() + 2.0 * np.diff(frequency)[0]
+            most,
+            1.5 * np.abs(frequency[largest >= _MIN_SHOWN * largest.max(initial=0.0)]).max(initial=0.0)
+            + 2.0 * np.diff(frequency[:2]).sum(),
         )
     shown = np.abs(frequency) <= limit
+    if (lines := int(np.count_nonzero(shown))) < 3:
+        raise InputError("spectrum", "of at least 3 lines; use more rows or a higher limit", lines)
     return frequency[shown], amplitude[..., shown]
 
 
@@ -286,7 +290,7 @@ def _draw_map(
     from matplotlib.colors import LogNorm
 
     (panel,) = make_axes(axes, 1, 1, height=5.6, title=f"{title}, {describe_span(probes)}", note=note)
-    highest = max(float(np.nanmax(amplitude)), 1e-300)
+    highest = max(float(np.nanmax(amplitude)), _SCALE_FLOOR)
     shown = np.ma.masked_invalid(np.maximum(amplitude, _DYNAMIC_RANGE * highest))
     norm = LogNorm(_DYNAMIC_RANGE * highest, highest)
     if len(times_s) == 1:

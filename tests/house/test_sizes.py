@@ -37,7 +37,7 @@ BUDGETS = {
     "replays/campaigns": 3318,
     "replays/estimate": 342,
     "replays/player": 816,
-    "replays/plots": 1603,
+    "replays/plots": 1651,
     "replays/recordings": 10381,
     "replays/report": 494,
     "replays/score": 4248,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -200,7 +201,26 @@ def test_tables_are_written_with_units_and_conventions(tmp_path: Path) -> None:
         (lambda plot: plot.orbit(pair="disc"), "pair must be a pair of probes, such as disk"),
         (lambda plot: plot.orbit(components="3X"), "components must be some of raw, 1X and 2X; received '3X'"),
         (lambda plot: plot.timebase(channels=["disk_z"]), "channels must be channels of the data, such as disk_"),
-        (lambda plot: plot.orbit(last_s=0.0), "last_s must be greater than 0; received 0.0"),
+        (lambda plot: plot.orbit(last_s=0.0), "last_s must be a number greater than 0; received 0.0"),
+        (lambda plot: plot.orbit(last_s="1"), "last_s must be a number greater than 0; received '1'"),
+        (lambda plot: plot.orbit(from_s=math.nan), "from_s must be a number; received nan"),
+        (lambda plot: plot.orbit(pair=["disk"]), r"pair must be a name; received \['disk'\]"),
+        (lambda plot: plot.orbit(source=1), "option of orbit must be one that it has, .*; received 'source'"),
+        (lambda plot: plot.orbit(clearance=math.nan), "clearance must be a number of at least 0; received nan"),
+        (
+            lambda plot: plot.orbit(probe_angles_deg=45),
+            "probe_angles_deg must be two directions in degrees; received 45",
+        ),
+        (lambda plot: plot.orbit(runout=0.1), "runout must be a run-out, of measure_runout; received 0.1"),
+        (lambda plot: plot.full_spectrum(max_hz=-5), "max_hz must be a number greater than 0; received -5"),
+        (lambda plot: plot.full_spectrum(max_hz=1e-3), "spectrum must be of at least 3 lines; .*; received 1"),
+        (lambda plot: plot.waterfall(window_s=math.nan), "window_s must be a number greater than 0; received nan"),
+        (lambda plot: plot.orders(turns=0), "turns must be a whole number of at least 1; received 0"),
+        (lambda plot: plot.bode(orders=1), "orders must be a list of whole numbers from 1 to 100; received 1"),
+        (lambda plot: plot.trend(orders=[]), r"orders must be a list of whole numbers from 1 to 100; received \[\]"),
+        (lambda plot: plot.trend(orders=[0.5, 1]), r"orders must be a list of whole .*; received \[0.5, 1\]"),
+        (lambda plot: plot.timebase(channels=5), "channels must be a name or a list; received 5"),
+        (lambda plot: plot.orbit(axes=[1, 2, 3]), "axes must be matplotlib axes; received int"),
         (lambda plot: plot.orbit(from_s=9.0), "from_s and to_s must be within 0 to 3.9998 s; received 9.0 to None"),
         (lambda plot: plot.orbit(axes=[None, None]), "axes must be 3 axes; received 2"),
     ],
@@ -208,6 +228,28 @@ def test_tables_are_written_with_units_and_conventions(tmp_path: Path) -> None:
 def test_wrong_arguments_name_the_nearest(call: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         call(build_whirl(0.3, 0.1).plot)
+
+
+def test_orders_of_runout_are_a_whole_number() -> None:
+    with pytest.raises(InputError, match="orders must be a whole number of at least 1; received 0"):
+        measure_runout(build_whirl(0.3, 0.1), orders=0)
+    with pytest.raises(InputError, match="max_hz must be a number greater than 0; received 0"):
+        measure_runout(build_whirl(0.3, 0.1), max_hz=0)
+
+
+@pytest.mark.parametrize("name", ["full_spectrum", "waterfall", "orders"])
+@pytest.mark.parametrize("level", [0.0, 0.5])
+def test_a_channel_that_does_not_move_is_drawn(name: str, level: float, tmp_path: Path) -> None:
+    still = build_samples(disk_x=lambda times_s, _: 0.0 * times_s + level, disk_y=lambda times_s, _: 0.0 * times_s)
+    plot = getattr(still.plot, name)()
+    plot.save(tmp_path / f"{name}.png")
+    assert plot.table["amplitude"].max() < 1e-12
+
+
+@pytest.mark.parametrize(("name", "rows"), [("full_spectrum", 2), ("waterfall", 10)])
+def test_few_rows_have_no_spectrum(name: str, rows: int) -> None:
+    with pytest.raises(InputError, match=r"spectrum must be of at least 3 lines; .*; received 1"):
+        getattr(build_whirl(0.3, 0.1, duration_s=rows / RATE_HZ).plot, name)()
 
 
 def test_noise_of_a_keyphasor_at_standstill_is_no_passage() -> None:
@@ -305,7 +347,7 @@ def test_bode_needs_a_keyphasor_and_a_changing_speed() -> None:
         build_whirl(0.3, 0.1).plot.bode()
     with pytest.raises(InputError, match="Bode must be drawn with at least two keyphasor passages; received 0"):
         build_whirl(0.3, 0.1).select("disk_x", "disk_y").plot.bode()
-    with pytest.raises(InputError, match="orders must be whole numbers from 1 to 100; received 0"):
+    with pytest.raises(InputError, match=r"orders must be a list of whole numbers from 1 to 100; received \[0\]"):
         build_whirl(0.3, 0.1).plot.trend(orders=[0])
 
 
@@ -369,6 +411,12 @@ def test_orders_follow_the_speed() -> None:
     apart = np.abs(np.abs(table["order"]) - 2.5) > 0.3
     assert table["amplitude"][apart].max() < 0.003
     assert np.abs(table["order"]).max() == 4.0
+    whole = build_whirl(0.3, 0.05, speed_hz=(5.0, 25.0), duration_s=8.0)
+    slow = replace(
+        whole, times_s=whole.times_s[::5], index=whole.index[::5] // 5, values=whole.values[::5], rate_hz=1e3
+    )
+    table = slow.plot.orders(max_order=40.0).table  # from 40 to 200 samples per revolution
+    assert table["amplitude"][table["order"] == 1.0] == pytest.approx(0.3, rel=0.01)
     gap = drop_rows(build_whirl(0.3, 0.05, duration_s=10.0), 4.0, 6.0).plot.orders().table
     assert not ((gap["time"] > 3.5) & (gap["time"] < 6.5)).any()
 
