@@ -197,10 +197,9 @@ class RecordingFile:
                 here = self._topics_in(chunk, wanted)
                 if not here or (chunk.channels is not None and chunk.channels.isdisjoint(here)):
                     continue
-                for number, log_time, publish_time, payload in messages(unpack(file, chunk), cut=chunk.cut):
-                    if number in here:
-                        topic = here[number]
-                        yield topic, log_time, publish_time, schemas.unwrap_text(payload) if topic in texts else payload
+                for number, log_time, publish_time, payload in messages(unpack(file, chunk), here, cut=chunk.cut):
+                    topic = here[number]
+                    yield topic, log_time, publish_time, schemas.unwrap_text(payload) if topic in texts else payload
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[BinaryIO]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from typing import BinaryIO
@@ -86,12 +86,13 @@ def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]
         raise DamagedError("records that do not end with their chunk")
 
 
-def messages(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int, bytes]]:
-    """Yield channel, simulated time [ns], arrival time [unix ns] and payload of each message of a chunk."""
+def messages(data: bytes, wanted: Container[int], *, cut: bool = False) -> Iterator[tuple[int, int, int, bytes]]:
+    """Yield channel, simulated time [ns], arrival time [unix ns] and payload of the messages of some channels."""
     for opcode, start, end in records(data, cut=cut):
         if opcode == Opcode.MESSAGE:
             number, _, log_time, publish_time = stamp(data, start, end)
-            yield number, log_time, publish_time, data[start + MESSAGE.size : end]
+            if number in wanted:
+                yield number, log_time, publish_time, data[start + MESSAGE.size : end]
 
 
 def unpack(file: BinaryIO, chunk: Chunk) -> bytes:

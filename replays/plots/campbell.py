@@ -10,7 +10,7 @@ import numpy as np
 from replays.estimate.spectra import parabola_top
 from replays.plots.plot import Plot, Table, describe_title, kind, make_axes
 from replays.plots.signals import Signals
-from replays.plots.spectra import choose_window, compute_spectra
+from replays.plots.spectra import read_spectra
 from replays.report.canvas import BLACK, BLUE, ORANGE, RED
 from rig.base.errors import InputError
 from rig.physics.kernels import signals as S
@@ -161,10 +161,8 @@ def _find_crossing(excess: Any, top_hz: float) -> float | None:
 
 def _find_peaks(signals: Signals, pair: str | None) -> np.ndarray:
     """Return speed and frequency of the peaks of the measured spectra, negative for backward, shape (n, 2) [Hz]."""
-    from scipy.signal import find_peaks
-
     probes, edges_s = signals.read_pair(pair), signals.edges_s
-    times_s, frequency, amplitude = compute_spectra(probes, None, choose_window(probes))
+    times_s, frequency, amplitude = read_spectra(signals, probes, None, None)
     speed_hz = np.zeros(len(times_s))
     if len(edges_s) > 1:
         speed_hz = np.interp(times_s, 0.5 * (edges_s[1:] + edges_s[:-1]), 1.0 / np.diff(edges_s))
@@ -172,7 +170,9 @@ def _find_peaks(signals: Signals, pair: str | None) -> np.ndarray:
     found = []
     for row in np.unique(np.linspace(0, len(times_s) - 1, _MAX_POINTS).astype(int)):
         spectrum = np.nan_to_num(amplitude[row] + 0.0 * speed_hz[row])
-        tops, _ = find_peaks(spectrum, height=max(_MIN_PEAK * spectrum.max(), 1e-300))
+        inner = spectrum[1:-1]
+        high = (inner > spectrum[:-2]) & (inner > spectrum[2:]) & (inner >= max(_MIN_PEAK * spectrum.max(), 1e-300))
+        tops = 1 + np.flatnonzero(high)
         for top in sorted(tops, key=lambda at: -spectrum[at])[:_MAX_PEAKS]:
             shift, _ = parabola_top(*np.log(np.maximum(spectrum[top - 1 : top + 2], 1e-300)))
             found.append((speed_hz[row], frequency[top] + shift * (frequency[1] - frequency[0])))

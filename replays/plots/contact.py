@@ -57,7 +57,7 @@ def contact(signals: Signals, *, axes: Any = None) -> Plot:
     whole = _read_truth(signals, "contact", "penetration", "penetration_rate", "normal_force", "onset_speed")
     touching = whole.values[:, 0] > 0.0
     if not touching.any():
-        raise InputError("contact", "drawn of data with a contact", Words("none"))
+        raise InputError("contact", "in the data", Words("none"))
     (depth, rate, force, onset), index = whole.values[touching].T, whole.index[touching]
     law = signals.require_model("contact").constants.contact
     elastic = law.stiffness * depth**law.exponent
@@ -162,10 +162,16 @@ def rolling(signals: Signals, *, pair: str | None = None, axes: Any = None) -> P
     Raises:
         InputError: There is no contact, no clearance or no keyphasor.
     """
+    if (name := TRUTH + "penetration") in signals.channels:  # decides before long channels are read
+        truth = signals.read(name)
+        if truth.rate_hz >= _MIN_RATE_HZ and not (truth.values > 0.0).any():
+            raise InputError("contact", "in the data", Words("none"))
     probes = signals.read_pair(pair or ("ring" if "ring" in signals.pairs else None))
     samples, x, y = probes.samples, probes.x, probes.y
     times_s, radius = samples.times_s, probes.clearance
     touching, depth, criterion = _find_contact(signals, samples, np.hypot(x, y), radius)
+    if not touching.any():
+        raise InputError("contact", "in the data", Words("none"))
     theta = TRUTH + "theta"
     if theta in signals.channels:
         model = signals.read(theta)
@@ -174,7 +180,7 @@ def rolling(signals: Signals, *, pair: str | None = None, axes: Any = None) -> P
         turns = compute_revolutions(times_s, signals.require_edges("rolling"))
     touching &= np.isfinite(turns)
     if not touching.any():
-        raise InputError("rolling", "drawn of data with a contact", Words("none"))
+        raise InputError("contact", "in the data", Words("none"))
     whirl = phase(x, y) / (2.0 * math.pi)
     breaks = np.diff(samples.index) != 1
     drawn = np.where(touching, 1.0, np.nan)

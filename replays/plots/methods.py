@@ -37,11 +37,11 @@ KINDS: Mapping[str, Callable[..., Plot]] = {
     "restitution": restitution,
     "rolling": rolling,
 }
-"""Functions by name, in the order of `rig plot`."""
+"""Functions by name."""
 
 
 def list_pictures(signals: Signals, kinds: Sequence[str] = ()) -> dict[str, Callable[[], Plot]]:
-    """Return functions that draw all pictures of the data, by file name.
+    """Return functions that draw all pictures of the data, by file name, in an order in which each group is read once.
 
     A kind with an option `pair` or `channels` has a picture for each pair of displacement probes, a timebase one for
     each group.
@@ -61,7 +61,8 @@ def list_pictures(signals: Signals, kinds: Sequence[str] = ()) -> dict[str, Call
     groups: dict[str, list[str]] = {}
     for name in signals.names:
         groups.setdefault(signals.channels[name][0], []).append(name)
-    pictures: dict[str, Callable[[], Plot]] = {}
+    found: list[tuple[tuple[int, bool, str], str, Callable[[], Plot]]] = []
+    places = {group: place for place, group in enumerate(groups)}
     for kind, function in KINDS.items():
         each: dict[str, dict[str, Any]] = {"": {}}
         if kind == "timebase":
@@ -72,8 +73,18 @@ def list_pictures(signals: Signals, kinds: Sequence[str] = ()) -> dict[str, Call
                 for pair in (signals.pairs if kind in ("frequency_response", "modes") else pairs)
             }
         for name, options in each.items() if kind in (kinds or KINDS) else ():
-            pictures[re.sub(r"[^\w.-]+", "_", f"{kind}-{name}").rstrip("-")] = partial(function, signals, **options)
-    return pictures
+            # Pictures of one group, and of one pair, follow each other: the group is read once, and few are in memory.
+            group = name if kind == "timebase" else signals.channels[signals.pairs[name][0]][0] if name else ""
+            if kind in ("frequency_response", "modes") and "hammer" in signals.names:
+                group = signals.channels["hammer"][0]
+            place = (
+                len(places) if kind == "rolling" else places.get(group, len(places)),
+                kind not in ("orbit", "full_spectrum"),
+                "" if kind == "timebase" else name,
+            )
+            file = re.sub(r"[^\w.-]+", "_", f"{kind}-{name}").rstrip("-")
+            found.append((place, file, partial(function, signals, **options)))
+    return {file: draw for _, file, draw in sorted(found, key=lambda each: each[0])}
 
 
 class _UnknownKindError(UnknownNameError, AttributeError):

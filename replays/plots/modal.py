@@ -90,6 +90,8 @@ def read_hits(
     """
     names, pulses = signals.list_channels(channels), [each for each in signals.events() if each["event"] == "hammer"]
     source = next((each for each in ("hammer", TRUTH + "hammer_force") if each in signals.channels), None)
+    if not (pulses if source != "hammer" else _has_hits(signals)):
+        raise InputError("hammer", "in the data, as a channel `hammer` or as events of hits", Words("no hit"))
     if source == "hammer":
         samples = signals.read(*names, source)
         force, unit = samples.values[:, -1], samples.units[-1]
@@ -99,7 +101,7 @@ def read_hits(
         for each in pulses:
             phase = (samples.times_s - each["time_s"]) / (1e-3 * each["duration_ms"])
             force += np.where((phase > 0.0) & (phase < 1.0), each["force_n"] * np.sin(math.pi * phase), 0.0)
-    noise = 1.5 * float(np.median(np.abs(force - np.median(force)))) if len(force) else 0.0
+    noise = _estimate_noise(force)
     if not force.max(initial=0.0) > _MIN_SIGNAL_TO_NOISE * noise:
         raise InputError("hammer", "in the data, as a channel `hammer` or as events of hits", Words("no hit"))
     high, rate_hz = force > max(_FOOT * force.max(), 0.5 * _MIN_SIGNAL_TO_NOISE * noise), samples.rate_hz
@@ -141,6 +143,21 @@ def read_hits(
     dropped = len(chosen) - len(whole)
     wanted = " and ".join(dict.fromkeys(labels[at] for at in chosen))
     return Hits(unit, wanted, starts_s[whole], pulse, responses, after, samples.select(*names), dropped)
+
+
+def _has_hits(signals: Signals) -> bool:
+    """Return whether the channel `hammer` has a hit, before other channels are read."""
+
+    def compute() -> tuple[bool]:
+        force = signals.read("hammer").values[:, 0]
+        return (force.max(initial=0.0) > _MIN_SIGNAL_TO_NOISE * _estimate_noise(force),)
+
+    return signals.recall("has hits", compute)[0]
+
+
+def _estimate_noise(force: np.ndarray) -> float:
+    """Return the noise of a force, from its median absolute deviation."""
+    return 1.5 * float(np.median(np.abs(force - np.median(force)))) if len(force) else 0.0
 
 
 @kind()

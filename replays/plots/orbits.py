@@ -60,7 +60,7 @@ def orbit(
         if name not in COMPONENTS:
             raise UnknownNameError("components", "some of raw, 1X and 2X", name, COMPONENTS)
     times_s = probes.samples.times_s
-    _, turns = fit_orders(probes.samples, np.stack([probes.x, probes.y], axis=1), edges_s, (1, 2))
+    _, turns = fit_orders(probes.samples, probes.xy, edges_s, (1, 2))
     if not len(turns) and set(components) - {"raw"}:
         raise InputError("components", "raw, as there is no whole revolution in these data", list(components))
     shown = list(components) or list(COMPONENTS if len(turns) else COMPONENTS[:1])
@@ -166,7 +166,7 @@ def centreline(signals: Signals, *, pair: str | None = None, clearance: float | 
     probes, edges_s = signals.read_pair(pair), signals.edges_s
     times_s = probes.samples.times_s
     limits_s = edges_s if len(edges_s) > 1 else np.arange(times_s[0], times_s[-1], _BLOCK_S)
-    turns, means = fit_orders(probes.samples, np.stack([probes.x, probes.y], axis=1), limits_s)
+    turns, means = fit_orders(probes.samples, probes.xy, limits_s)
     if not len(turns):
         raise InputError("times", "with a whole revolution", describe_span(probes))
     (x, y), at_s = means[:, 0].real.T, 0.5 * (limits_s[1:] + limits_s[:-1])[turns]

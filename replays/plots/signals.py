@@ -1,15 +1,15 @@
 """Signals: the one input of all plots, built from a run, a recording, or samples.
 
 Values are engineering values with their times; rows that are missing stay missing. Groups of a recording are read when
-they are used, only within the requested times, and only the last one is kept in memory.
+they are used, only within the requested times. What was read and computed last is kept, up to a size.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -39,6 +39,41 @@ Load = Callable[[str, float, float], Samples]
 """Function of a group and the times of its first and last row [s] that returns at least these rows."""
 
 
+_CACHE_BYTES = 100_000_000
+"""Size up to which earlier results of one kind are kept, beside the latest: all groups of some seconds."""
+
+
+class Cache:
+    """The latest results of one source, such as groups; large ones are dropped before the next one is computed."""
+
+    def __init__(self) -> None:
+        self._results: dict[tuple[Hashable, ...], Any] = {}
+
+    def recall(self, key: tuple[Hashable, ...], compute: Callable[[], Any]) -> Any:
+        """Return samples or a tuple of arrays, computed unless they are kept.
+
+        Args:
+            key: Kind of the result, and what it depends on; a group (`load`) replaces results of all kinds.
+            compute: Function without arguments that computes it.
+        """
+        result = self._results.pop(key, None)
+        if result is None:
+            kept = {each: value for each, value in self._results.items() if key[0] in ("load", each[0])}
+            while sum(map(_count_bytes, kept.values())) > _CACHE_BYTES:
+                oldest = next(iter(kept))
+                del kept[oldest], self._results[oldest]
+            kept.clear()
+            result = compute()
+        self._results[key] = result
+        return result
+
+
+def _count_bytes(result: Any) -> int:
+    """Return the size of samples, or of a tuple of arrays."""
+    arrays = (result.times_s, result.index, result.values) if isinstance(result, Samples) else result
+    return sum(each.nbytes for each in arrays if isinstance(each, np.ndarray))
+
+
 class Pair(NamedTuple):
     """Signals of two perpendicular probes, x to the right and y up.
 
@@ -58,12 +93,18 @@ class Pair(NamedTuple):
     clearance: float | None
 
     @property
+    def xy(self) -> np.ndarray:
+        """Displacements, shape (n, 2)."""
+        values = self.samples.values
+        return values if np.may_share_memory(self.x, values) else np.stack([self.x, self.y], axis=1)
+
+    @property
     def unit(self) -> str:
         """Unit of the displacements."""
         return self.samples.units[0]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Runout:
     """Run-out of probes: the waveform per revolution that remains at slow roll, as its Fourier components.
 
@@ -146,6 +187,7 @@ class Signals:
         model: Builds the model of the rig; None for data without one.
         runout: Run-out to subtract.
         probe_angles_deg: Directions of the x and the y probe, counter-clockwise from the right [degrees].
+        cache: Results that several plots use.
     """
 
     title: str
@@ -158,6 +200,17 @@ class Signals:
     model: Callable[[], Model] | None = None
     runout: Runout | None = None
     probe_angles_deg: tuple[float, float] = (0.0, 90.0)
+    cache: Cache = field(default_factory=Cache)
+
+    def recall(self, what: str, compute: Callable[[], Any], *options: Hashable) -> Any:
+        """Return a result of these signals that several plots use, computed unless the cache has it.
+
+        Args:
+            what: Name of the result.
+            compute: Computes it: samples, or a tuple of arrays.
+            options: What it depends on, apart from the signals.
+        """
+        return self.cache.recall((what, *self.span_s, *self.probe_angles_deg, self.runout, *options), compute)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -200,8 +253,14 @@ class Signals:
         for name in names:
             if name not in self.channels:
                 raise UnknownNameError("channels", "channels of the data", name, self.channels)
-        groups = dict.fromkeys(self.channels[name][0] for name in names)
-        whole = merge_samples([self.load(group, *self.span_s) for group in groups]).select(*names)
+        return self.recall("read", lambda: self._read(names), *names) if len(names) > 1 else self._read(names)
+
+    def _read(self, names: Sequence[str]) -> Samples:
+        groups: dict[str, list[str]] = {}
+        for name in names:
+            groups.setdefault(self.channels[name][0], []).append(name)
+        parts = [self.load(group, *self.span_s).select(*each) for group, each in groups.items()]
+        whole = parts[0] if len(parts) == 1 else merge_samples(parts).select(*names)
         first, last = self.span_s
         kept = (whole.times_s >= first) & (whole.times_s <= last) & np.isfinite(whole.values).all(axis=1)
         if not (np.diff(whole.times_s) > 0.0).all():  # rows arrived late or twice
@@ -295,8 +354,9 @@ def compute_revolutions(times_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     from scipy.interpolate import PchipInterpolator
 
     revolutions = PchipInterpolator(edges_s, np.arange(len(edges_s)))(np.clip(times_s, edges_s[0], edges_s[-1]))
-    revolutions += np.minimum(times_s - edges_s[0], 0.0) / (edges_s[1] - edges_s[0])
-    return revolutions + np.maximum(times_s - edges_s[-1], 0.0) / (edges_s[-1] - edges_s[-2])
+    for rows, at, nearest in ((times_s < edges_s[0], 0, 1), (times_s > edges_s[-1], -1, -2)):
+        revolutions[rows] += (times_s[rows] - edges_s[at]) / abs(edges_s[at] - edges_s[nearest])
+    return revolutions
 
 
 def fit_orders(
@@ -476,8 +536,12 @@ def _read_recording(recording: Any) -> Signals:
     if (span_s := recording.span_s) is None:
         raise InputError("recording", "with rows", Words("none"))
 
-    @lru_cache(maxsize=1)
+    cache = Cache()
+
     def load(group: str, first_s: float, last_s: float) -> Samples:
+        return cache.recall(("load", group, first_s, last_s), lambda: read_group(group, first_s, last_s))
+
+    def read_group(group: str, first_s: float, last_s: float) -> Samples:
         part = recording.between(first_s, last_s)
         if not group.startswith(TRUTH):
             return part.samples(group)
@@ -500,7 +564,8 @@ def _read_recording(recording: Any) -> Signals:
         load_edges=load_edges,
         clearances=_compute_clearances(recording.table, recording.parameters.get("values", {})),
         events=lambda: recording.events,
-        model=partial(_build_model, recording) if isinstance(recording.scene.get("scene"), dict) else None,
+        model=lru_cache(partial(_build_model, recording)) if isinstance(recording.scene.get("scene"), dict) else None,
+        cache=cache,
     )
 
 

@@ -94,7 +94,7 @@ def waterfall(
     """
     probes = signals.read_pair(pair)
     window_s = choose_window(probes) if window_s is None else window_s
-    times_s, frequency, amplitude = compute_spectra(probes, max_hz, window_s)
+    times_s, frequency, amplitude = read_spectra(signals, probes, max_hz, window_s)
     note = f"{describe_frame(signals)}; Hann windows of {window_s:g} s; gaps in the data are left open"
     title = describe_title(signals, f"Waterfall at {probes.name}")
     return _draw_map(axes, probes, times_s, frequency, amplitude, title, note, ("frequency", "Hz", _SIDES))
@@ -124,7 +124,7 @@ def orders(
     probes, edges_s = signals.read_pair(pair), signals.require_edges("order spectrum")
     samples_s = probes.samples.times_s
     revolutions, places = compute_revolutions(samples_s, edges_s), np.searchsorted(samples_s, edges_s)
-    found = []
+    orbit, found = probes.xy, []
     for first in range(0, len(edges_s) - turns, max(1, turns // 2, len(edges_s) // _MAX_SPECTRA)):
         begin, end = max(0, places[first] - 1), min(len(samples_s), places[first + turns] + 1)
         angle = revolutions[begin:end]
@@ -137,7 +137,7 @@ def orders(
             continue  # a gap
         count = 1 << int(np.ceil(np.log2(len(angle))))
         even = first + turns * np.arange(count) / count
-        x, y = CubicSpline(angle, np.stack([probes.x, probes.y], axis=1)[begin:end])(even).T
+        x, y = CubicSpline(angle, orbit[begin:end])(even).T
         order, amplitude = compute_spectrum(x, y, count / turns)
         found.append((edges_s[first : first + turns + 1].mean(), order, amplitude))
     if not found:
@@ -180,7 +180,7 @@ def cascade(
     """
     probes, edges_s = signals.read_pair(pair), signals.require_edges("cascade")
     window_s = choose_window(probes) if window_s is None else window_s
-    times_s, frequency, amplitude = compute_spectra(probes, max_hz, window_s)
+    times_s, frequency, amplitude = read_spectra(signals, probes, max_hz, window_s)
     speed_hz = np.interp(times_s, 0.5 * (edges_s[1:] + edges_s[:-1]), 1.0 / np.diff(edges_s))
     usable = np.isfinite(amplitude).all(axis=1) & (times_s >= edges_s[0]) & (times_s <= edges_s[-1])
     speed_hz, amplitude = speed_hz[usable], amplitude[usable]
@@ -245,12 +245,19 @@ def choose_window(probes: Pair) -> float:
     return round(min(max(0.1 * span_s, 0.15), 1.0, 0.5 * span_s), 3)
 
 
-def compute_spectra(probes: Pair, max_hz: float | None, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times, frequencies and amplitudes of spectra, with nan at gaps.
+def read_spectra(
+    signals: Signals, probes: Pair, max_hz: float | None, window_s: float | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, frequencies and amplitudes of a pair's spectra, with nan at gaps.
 
     Raises:
         InputError: No part without a gap is as long as the window.
     """
+    window_s = choose_window(probes) if window_s is None else window_s
+    return signals.recall("spectra", lambda: _compute_spectra(probes, max_hz, window_s), probes.name, max_hz, window_s)
+
+
+def _compute_spectra(probes: Pair, max_hz: float | None, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     samples = probes.samples
     pieces = [each for each in find_pieces(samples) if each.stop - each.start >= round(window_s * samples.rate_hz)]
     if not pieces:

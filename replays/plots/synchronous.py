@@ -67,7 +67,9 @@ def _fit(signals: Signals, channels: Sequence[str], orders: Sequence[int], what:
     """
     names, edges_s = signals.list_channels(channels), signals.require_edges(what)
     samples = signals.read(*names)
-    turns, fitted = fit_orders(samples, samples.values, edges_s, tuple(orders))
+    turns, fitted = signals.recall(
+        "fit", lambda: fit_orders(samples, samples.values, edges_s, tuple(orders)), *names, *orders
+    )
     if not len(turns):
         raise InputError(
             "times", f"with a whole revolution for a {what} plot", Words("{:g} to {:g} s".format(*signals.span_s))

@@ -34,8 +34,10 @@ DPI = 140
 """Resolution of a PNG [dots/inch], sharp on a scaled-down page and on a high-resolution screen."""
 _PALETTE_ROUNDS = 2
 """Rounds of k-means for the palette of a PNG; further rounds change no colour visibly."""
-_CHANNEL_WEIGHTS = np.array([1 << 16, 1 << 8, 1])
-"""Weights of red, green and blue in the number of a colour."""
+_RGB = 0xFFFFFF
+"""Mask of the red, green and blue bits of a pixel, without opacity."""
+_COMPRESSION = 7
+"""Compression level of a PNG; level 9 needs five times the time and gives files that are 6 % smaller."""
 _MIN_BAND_PERIODS, _MAX_SLICES = 80, 240
 """Periods from which a signal is drawn as a band, and the largest number of time slices in the band."""
 _SALT = "rotor-stator-rig"
@@ -188,19 +190,34 @@ def png(figure: Figure, *, dpi: int = DPI, source: str = "") -> bytes:
         dpi: Dots per inch.
         source: Source of the data, for the metadata field Source.
     """
-    from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     _disable_mathtext(figure)
     about = PngInfo()
     if source:
         about.add_text("Source", source)
+    buffer = io.BytesIO()
+    image = _apply_palette(_render(figure, dpi))
+    image.save(buffer, format="png", compress_level=_COMPRESSION, pnginfo=about)
+    return buffer.getvalue()
 
-    buffer, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    with Image.open(buffer) as image:
-        _apply_palette(image.convert("RGB")).save(small, format="png", optimize=True, pnginfo=about)
-    return small.getvalue()
+
+def _render(figure: Figure, dpi: int) -> np.ndarray:
+    """Return the pixels of a figure as red + 256 green + 65536 blue, shape (height, width).
+
+    Unlike `Figure.savefig`, it draws once and encodes nothing. Canvas and resolution are restored.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas, former = figure.canvas, figure.dpi
+    try:
+        figure.dpi = dpi
+        drawn = FigureCanvasAgg(figure)
+        drawn.draw()
+        return np.asarray(drawn.buffer_rgba()).view("<u4")[:, :, 0] & _RGB
+    finally:
+        figure.set_canvas(canvas)
+        figure.dpi = former
 
 
 def _disable_mathtext(figure: Figure) -> None:
@@ -222,21 +239,25 @@ def _disable_mathtext(figure: Figure) -> None:
             text.set_parse_math(False)
 
 
-def _apply_palette(image: Image) -> Image:
+def _apply_palette(pixels: np.ndarray) -> Image:
     """Return an image with a palette of at most 256 colours.
 
     This choice preserves faint tints, and steps of a colour scale stay invisible. It is the k-means of Pillow's
     `quantize(kmeans=...)`, applied to a few thousand colours instead of two million pixels.
 
     Args:
-        image: An RGB image.
+        pixels: Colours as of `_render`.
     """
     from PIL import Image
 
-    counted = image.getcolors(image.width * image.height)
-    assert counted is not None
-    counts, colours = np.array([n for n, _ in counted]), np.array([colour for _, colour in counted])
-    first = image.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=0, dither=Image.Dither.NONE)
+    flat = pixels.ravel()
+    starts = np.flatnonzero(np.diff(flat, prepend=flat[0] ^ 1))  # of runs of one colour
+    numbers, of_runs = np.unique(flat[starts], return_inverse=True)
+    lengths = np.diff(starts, append=len(flat))
+    counts, colours = np.bincount(of_runs, lengths), (numbers[:, None].astype(np.int64) >> np.array([0, 8, 16])) & 255
+    first = Image.fromarray(colours[None].astype(np.uint8)).quantize(
+        256, Image.Quantize.MAXCOVERAGE, kmeans=0, dither=Image.Dither.NONE
+    )
     means = np.array(first.getpalette(), dtype=float).reshape(-1, 3)
     for _ in range(_PALETTE_ROUNDS):
         nearest = _nearest(colours, means)
@@ -244,9 +265,8 @@ def _apply_palette(image: Image) -> Image:
         sums = np.stack([np.bincount(nearest, counts * part, len(means)) for part in colours.T], axis=1)
         means = np.where(weights[:, None] > 0.0, sums / np.maximum(weights, 1.0)[:, None], means)
     means = np.rint(means)
-    indices = np.zeros(1 << 24, np.uint8)
-    indices[colours @ _CHANNEL_WEIGHTS] = _nearest(colours, means)
-    paletted = Image.fromarray(indices[np.asarray(image, dtype=np.int32) @ _CHANNEL_WEIGHTS])
+    indices = np.repeat(_nearest(colours, means).astype(np.uint8)[of_runs], lengths)
+    paletted = Image.fromarray(indices.reshape(pixels.shape))
     paletted.putpalette(means.astype(np.uint8).tobytes())
     return paletted
 

@@ -212,8 +212,11 @@ def merge_samples(parts: Sequence[Samples]) -> Samples:
     """
     if len(parts) == 1:
         return parts[0]
-    index = reduce(np.intersect1d, [part.index for part in parts]) if parts else np.empty(0)
-    rows = [np.intersect1d(part.index, index, return_indices=True)[1] for part in parts]
+    index = parts[0].index if parts else np.empty(0)
+    rows: list[Any] = [slice(None)] * len(parts)
+    if not (np.diff(index) > 0).all() or any(not np.array_equal(part.index, index) for part in parts):
+        index = reduce(np.intersect1d, [part.index for part in parts])
+        rows = [np.intersect1d(part.index, index, return_indices=True)[1] for part in parts]
     times = [part.times_s[chosen] for part, chosen in zip(parts, rows, strict=True)]
     same_rate = len({part.rate_hz for part in parts}) == 1  # with different rates, a part may have no row in common
     if not same_rate or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_INSTANT_S for each in times):

@@ -280,7 +280,7 @@ def _check_rows(*, at_least: int = 1, **arrays: ArrayLike) -> list[np.ndarray]:
             raise InputError(name, f"as long as {next(iter(arrays))}, {len(rows[0])}", Words(f"{len(row)}"))
         if name in _INSTANTS and (np.diff(row) <= 0.0).any():
             raise InputError(name, "ascending", Words("instants that are not"))
-        rows.append(row.astype(float))
+        rows.append(row.astype(float, copy=False))
     return rows
 
 

@@ -85,7 +85,9 @@ def test_a_palette_keeps_tints_and_steps_of_a_scale() -> None:
     axes = figure.subplots()
     axes.imshow(np.linspace(0.0, 1.0, 600).reshape(20, 30), cmap="viridis")
     axes.axvspan(10.0, 20.0, color="#FFF7E6")
+    canvas, dpi = figure.canvas, figure.dpi
     whole, few = io.BytesIO(), io.BytesIO(png(figure, dpi=60))
+    assert (figure.canvas, figure.dpi) == (canvas, dpi)
     figure.savefig(whole, format="png", dpi=60)
     with Image.open(whole) as right, Image.open(few) as found:
         assert len(found.getcolors() or []) <= 256

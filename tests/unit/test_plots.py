@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import math
 from dataclasses import replace
@@ -450,7 +451,8 @@ def test_the_command_draws_each_pair_and_group(
     assert {Path(line).name for line in out.splitlines()} == names
     assert {"orbit-disk.svg", "orbit-ring.csv", "timebase-forces.svg", "timebase-drive.csv"} <= names
     assert not any(name.startswith("bode") for name in names)
-    assert "bode-disk: left out: speed must be that of a run-up" in err
+    assert err.count("left out: ") == 1
+    assert "left out: bode-disk, bode-ring: speed must be that of a run-up" in err
     table = np.genfromtxt(tmp_path / "out/orbit-disk.csv", delimiter=",", skip_header=1)
     assert table[0, 0] >= 0.1
     assert rig_plot(SESSION, "-o", tmp_path / "few", "--only", "orbit", "--parquet") == 0
@@ -484,6 +486,34 @@ def test_wrong_options_of_the_command_are_one_line(
     assert rig_plot(SESSION, "-o", tmp_path / "out", *arguments) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_command_names_the_reason_why_a_folder_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: Any) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    assert rig_plot(SESSION, "-o", tmp_path) == 2
+    must = f"rig: --output must be a folder that can be written to; received {tmp_path} (Read-only file system)\n"
+    assert capsys.readouterr().err == must
+
+
+def test_a_recording_is_read_once_for_all_plots_of_a_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    from replays.plots.methods import list_pictures
+
+    read: list[str] = []
+    original = Recording.samples
+    monkeypatch.setattr(Recording, "samples", lambda self, *names: (read.extend(names), original(self, *names))[1])
+    monkeypatch.setattr("replays.plots.signals._CACHE_BYTES", 0)  # as for a long recording
+    with Recording.open(SESSION) as recording:
+        pictures = list_pictures(read_signals(recording), ["timebase", "centreline", "waterfall", "trend"])
+        assert list(pictures)[:3] == ["timebase-probes", "centreline-disk", "waterfall-disk"]
+        for draw in pictures.values():
+            draw()
+    assert "probes" in read
+    assert sorted(read) == sorted(set(read))
 
 
 def test_interrupting_the_command_keeps_the_pictures_that_are_written(

@@ -89,7 +89,7 @@ def test_an_impact_with_a_gap_has_no_restitution() -> None:
     assert len(restitution(cut).table) == len(SPEEDS) - 1
     with pytest.raises(InputError, match=r"restitution must be drawn of data with impacts .*; received none, at 20000"):
         restitution(signals, to_s=0.005)
-    with pytest.raises(InputError, match="contact must be drawn of data with a contact; received none"):
+    with pytest.raises(InputError, match="contact must be in the data; received none"):
         contact(signals, to_s=0.005)
     with pytest.raises(InputError, match=r"contact must be drawn of data with truth.penetration, .*; received data"):
         build_samples(1.0, a=lambda times_s, _: times_s).plot.contact()
@@ -112,7 +112,7 @@ def test_rolling_shows_the_angles_of_a_known_whirl() -> None:
     assert angle.lines[2].get_label() == f"rolling: {law:.3f}".replace("-", "−")
     thick = path.lines[1].get_xydata()
     assert np.hypot(*thick[~np.isnan(thick).any(axis=1)].T) == pytest.approx(clearance)
-    with pytest.raises(InputError, match="rolling must be drawn of data with a contact; received none"):
+    with pytest.raises(InputError, match="contact must be in the data; received none"):
         rolling(signals, to_s=0.9)
     with pytest.raises(InputError, match="rolling must be drawn of a pair of probes in a plane with a known clearance"):
         rolling(samples)

@@ -155,7 +155,8 @@ def test_each_pair_has_a_frequency_response_also_of_accelerometers() -> None:
     names, units = ("disk_x", "inner_x", "inner_y", "disk_y", "hammer"), ("mm", "m/s^2", "m/s^2", "mm", "N")
     both = replace(samples, values=samples.values[:, [0, 0, 1, 1, 2]], names=names, units=units)
     pictures = list_pictures(read_signals(both), ["frequency_response", "modes"])
-    kinds = ("frequency_response", "modes")
-    assert list(pictures) == [f"{kind}-{pair}" for kind in kinds for pair in ("disk", "inner")]
+    assert list(pictures) == [
+        f"{kind}-{pair}" for pair in ("disk", "inner") for kind in ("frequency_response", "modes")
+    ]
     table = pictures["frequency_response-inner"]().table
     assert table.units[table.names.index("inner_x H1")] == "(m/s^2)/N"

@@ -244,13 +244,13 @@ def test_picture_is_drawn(good: Recording, tmp_path: Path, monkeypatch: pytest.M
     from matplotlib.image import imread
 
     drawn: list[Figure] = []
-    save = Figure.savefig
+    original = Figure.draw
 
-    def kept(figure: Figure, *arguments: Any, **options: Any) -> None:
+    def kept(figure: Figure, renderer: Any) -> None:
         drawn.append(figure)
-        save(figure, *arguments, **options)
+        original(figure, renderer)
 
-    monkeypatch.setattr(Figure, "savefig", kept)
+    monkeypatch.setattr(Figure, "draw", kept)
     path = tmp_path / "hammer.png"
     draw(good, path)
     data = path.read_bytes()

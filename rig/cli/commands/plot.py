@@ -46,7 +46,8 @@ def plot(
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
     waveform = None if runout is None else measure_runout(join([runout]), orders=_RUNOUT_ORDERS)
     signals = read_signals(recording, from_s=from_s, to_s=to_s, runout=waveform)
-    pictures, written, reasons = list_pictures(signals, split_names(only)), list[Path](), list[str]()
+    pictures, written = list_pictures(signals, split_names(only)), list[Path]()
+    left_out: dict[tuple[str, str], tuple[list[str], InputError]] = {}
     last: InputError | None = None
     with reporting() as reporter:
         reporter.begin(len(pictures))
@@ -55,17 +56,18 @@ def plot(
                 drawn = draw()
             except InputError as error:
                 last = error
-                reasons.append(f"{name}: left out: {error}")
+                left_out.setdefault((error.field, error.must), ([], error))[0].append(name)
             else:
                 output.mkdir(exist_ok=True)
                 path = output / f"{name}{'.svg' if svg else '.png'}"
                 written += drawn.save(path, table=".parquet" if parquet else ".csv", source=str(recording.path))
+                drawn.axes[0].figure.clear()  # frees its arrays now, not at a later garbage collection
             reporter.step(name)
     if only and last is not None and not written:
         raise last
     for path in written:
         echo(path)
-    for line in reasons:
-        echo(line, err=True)
+    for names, reason in left_out.values():
+        echo(f"left out: {', '.join(names)}: {reason}", err=True)
     if not written:
         raise InputError("files", "recordings from which something can be drawn", str(recording.path))

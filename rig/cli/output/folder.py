@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
+import tempfile
 from pathlib import Path
 
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 
 
 def check_folder(path: Path, *, field: str) -> None:
@@ -22,5 +22,7 @@ def check_folder(path: Path, *, field: str) -> None:
         raise InputError(field, "a folder, not a file", str(path))
     if not path.parent.is_dir():
         raise InputError(field, "a folder, or a new one in a folder that exists", str(path))
-    if not os.access(path if path.exists() else path.parent, os.W_OK | os.X_OK):
-        raise InputError(field, "a folder that can be written to", str(path))
+    try:
+        tempfile.TemporaryFile(dir=path if path.exists() else path.parent).close()
+    except OSError as error:
+        raise InputError(field, "a folder that can be written to", Words(f"{path} ({error.strerror})")) from None
