@@ -85,5 +85,5 @@ def test_a_recording_has_the_diagram_of_its_run_and_a_log_has_none() -> None:
     assert found.values[:81, :7] == pytest.approx(run.plot.campbell(max_speed_hz=16.0).table.values[:81, :7], rel=1e-6)
     with pytest.raises(InputError, match="campbell must be drawn of a run or a recording of the rig, which has its"):
         build_whirl(0.3, 0.1).plot.campbell()
-    with pytest.raises(InputError, match=r"max_speed_hz must be above 0 and below 10000; received 0\.0"):
+    with pytest.raises(InputError, match=r"max_speed_hz must be a number greater than 0; received 0\.0"):
         run.plot.campbell(max_speed_hz=0.0)
