@@ -410,7 +410,7 @@ def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(
 
 EXTERNAL_CAMPAIGN = """
 title = "On a rig that is there"
-duration_s = 0.5
+duration_s = 3.0
 
 [device]
 command = "python device.py {url} {name} 0.5 well"
@@ -425,7 +425,7 @@ command = "hammer"
 
 [[expect]]
 event = "hammer"
-must = "0.1 to 0.4 s"
+must = "0.1 to 2.5 s"
 
 [[expect]]
 event = "note"
