@@ -444,9 +444,10 @@ def test_a_campaign_runs_on_a_recording_and_on_a_running_rig(folder: Path) -> No
     ]
     assert played["cases"][1]["measurements"][2]["value"] == pytest.approx(-81.7, abs=0.5)
     (folder / "there.campaign.toml").write_text(EXTERNAL_CAMPAIGN, encoding="utf-8")
-    with processes.start_rig("run", "stable-run", "--listen", "127.0.0.1:0", "--name", "there-for-a-campaign") as rig:
+    name = f"there-{os.getpid()}"  # other tests may run on this computer
+    with processes.start_rig("run", "stable-run", "--listen", "127.0.0.1:0", "--name", name) as rig:
         processes.read_line(rig, "listening on")
-        arguments = ("there.campaign.toml", "--url", "there-for-a-campaign")
+        arguments = ("there.campaign.toml", "--url", name)
         try:
             _, there = run_campaign(folder, *arguments, status=0)
         except AssertionError as error:  # a busy computer: the verdict is inconclusive, and says so

@@ -505,21 +505,25 @@ def test_close_works_even_if_a_callback_never_returns(monkeypatch: pytest.Monkey
 
 def test_a_lossy_subscriber_that_stalls_keeps_the_newest() -> None:
     got: list[int] = []
-    go = threading.Event()
+    entered, go = threading.Event(), threading.Event()
 
     def take(_: str, payload: bytes) -> None:
+        entered.set()
         go.wait(20.0)
         got.append(int(payload))
 
     # A server that does not wait may drop the newest message itself, where the machine is busy.
-    with ZenohServer(free_endpoint(), wait=True) as server, ZenohClient(server.endpoint) as client:
+    with ZenohServer(free_endpoint(), wait=True) as server:
         server.answer("rig/status", lambda _: b"")
-        client.subscribe("rig/**", take, lossless=False)
-        for n in range(5000):
-            server.publish("rig/status", str(n).encode())
-        client.settle()  # a reply on the same link: everything before it has arrived
-        go.set()
-        until(lambda: bool(got) and got[-1] == 4999)
+        with ZenohClient(server.endpoint) as client:
+            client.subscribe("rig/**", take, lossless=False)
+            # The server may receive the subscription later than the client's call returns.
+            until(lambda: server.publish("rig/status", b"0") or entered.is_set())
+            for n in range(1, 5000):
+                server.publish("rig/status", str(n).encode())
+            client.settle()  # a reply on the same link: everything before it has arrived
+            go.set()
+            until(lambda: bool(got) and got[-1] == 4999)
     assert got == sorted(got)
     assert len(got) <= 2001  # the first, and a full ring
 
