@@ -25,6 +25,7 @@ WATCHED_S = 0.25
 """Time over which the kind of motion is determined [s]: three revolutions of the shaft in backward whirl at 1 Hz."""
 _CONTACT_SHARE = 0.95
 """Share of rows in contact from which the contact counts as lasting; losses of a few rows are waviness of the force."""
+_WATCHED = [COLUMN[name] for name in ("penetration", "ring_x", "ring_y")]
 BRANCH_ALARM = 1e-2
 """Energy residual over dissipated energy above which a run may have missed a contact or added a false one."""
 
@@ -85,37 +86,38 @@ class MotionWatch:
 
     def __init__(self, row_rate_hz: float) -> None:
         """Start without rows."""
-        self._row_rate_hz = row_rate_hz
-        self._blocks: deque[tuple[int, int, int, float]] = deque()
-        self._last = False, 0.0
+        self._row_rate_hz, self._most = row_rate_hz, round(WATCHED_S * row_rate_hz)
+        self._blocks: deque[np.ndarray] = deque()
+        self._count = 0
 
     def add(self, rows: np.ndarray) -> None:
         """Add the rows of a block, shape (n, N_ROW)."""
-        touching = rows[:, COLUMN["penetration"]] > 0.0
-        contact, angle = self._last
-        turned, starts = 0.0, 0
-        if touching.any() or contact:
-            angles = np.unwrap([angle, *np.arctan2(rows[:, COLUMN["ring_y"]], rows[:, COLUMN["ring_x"]])])
-            turned, angle = float(angles[-1] - angles[0]), float(angles[-1])
-            starts = int(np.count_nonzero(touching & ~np.append(contact, touching[:-1])))
-        self._last = bool(touching[-1]), angle
-        self._blocks.append((len(rows), int(np.count_nonzero(touching)), starts, turned))
-        while sum(count for count, *_ in self._blocks) - self._blocks[0][0] >= WATCHED_S * self._row_rate_hz:
-            self._blocks.popleft()
+        self._blocks.append(rows[-self._most :, _WATCHED])
+        self._count += len(self._blocks[-1])
+        while self._count - len(self._blocks[0]) >= self._most:
+            self._count -= len(self._blocks.popleft())
 
     def document(self) -> dict[str, Any] | None:
         """Return kind of motion, whirl frequency [Hz, forward positive] and impacts per second; None at the start."""
         if not self._blocks:
             return None
-        rows, touching, starts, turned = (sum(each) for each in zip(*self._blocks, strict=True))
-        seconds = rows / self._row_rate_hz
-        kind, frequency_hz = "free" if not touching else "impacts", None
-        if touching >= _CONTACT_SHARE * rows:
-            frequency_hz = turned / (2.0 * math.pi) / seconds
-            kind = "backward whirl" if frequency_hz < 0.0 else "forward whirl"
-            if abs(turned) < math.pi:
-                kind, frequency_hz = "resting", None
-        return {"kind": kind, "whirl_hz": frequency_hz, "impacts_hz": starts / seconds if kind == "impacts" else None}
+        # The same rows for any length of the blocks.
+        penetration, x, y = np.concatenate(self._blocks)[-self._most :].T
+        contact = penetration > 0.0
+        touching, seconds = int(np.count_nonzero(contact)), len(contact) / self._row_rate_hz
+        kind, whirl_hz, impacts_hz = "free", None, None
+        if touching >= _CONTACT_SHARE * len(contact):
+            angle = np.unwrap(np.arctan2(y, x))
+            turned = float(angle[-1] - angle[0]) * len(angle) / max(len(angle) - 1, 1)
+            kind = "resting"
+            if abs(turned) >= math.pi:
+                kind, whirl_hz = (
+                    "backward whirl" if turned < 0.0 else "forward whirl",
+                    turned / (2.0 * math.pi) / seconds,
+                )
+        elif touching:
+            kind, impacts_hz = "impacts", int(np.count_nonzero(contact[1:] & ~contact[:-1])) / seconds
+        return {"kind": kind, "whirl_hz": whirl_hz, "impacts_hz": impacts_hz}
 
 
 @dataclass

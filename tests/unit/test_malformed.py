@@ -240,7 +240,7 @@ CASES = [
         "no such scene",
         ("simulate", "nosuch", "-o", "out.csv"),
         "scene",
-        "one of drop, hammer, partial-rub, run-up, stable-run",
+        "one of coast-down, critical-speed, drop, hammer, hammer-house",
     ),
     Case("scene is a folder", ("simulate", ".", "-o", "out.csv"), "scene", "the path of a .toml file"),
     Case(

@@ -261,17 +261,17 @@ def test_a_new_shell_completes_after_installation(shell: str, tmp_path: Path) ->
     for path in (path for path in tmp_path.iterdir() if path.name.endswith("shrc")):
         assert path.read_text().count("completion --install") == 1
     if shell == "fish":
-        command_ = [shell, "-c", "complete -C 'rig run ham'"]
-        assert subprocess.check_output(command_, **settings).startswith(b"hammer\tHammer during a stable run")
+        command_ = [shell, "-c", "complete -C 'rig run stab'"]
+        assert subprocess.check_output(command_, **settings).startswith(b"stable-run\tContact-free run")
         return
     terminal = [sys.executable, "-c", f"import pty; pty.spawn(['{shell}', '-i'])"]
     with subprocess.Popen(terminal, stdin=subprocess.PIPE, stdout=subprocess.PIPE, **settings) as child:
         assert isinstance(child.stdout, io.BufferedReader)
         assert child.stdin is not None
         output = child.stdout.read1()  # its prompt
-        child.stdin.write(b"rig run ham\t")
+        child.stdin.write(b"rig run stab\t")
         child.stdin.flush()
-        while b"rig run hammer" not in output:
+        while b"rig run stable-run" not in output:
             more = child.stdout.read1()
             assert more, output
             output += more
