@@ -48,7 +48,7 @@ BUDGETS = {
     "rig/channels": 2452,
     "rig/cli": 5474,
     "rig/physics": 5486,
-    "rig/run": 1891,
+    "rig/run": 1892,
     "rig/serve": 3019,
 }
 _NO_CODE = (
