@@ -10,7 +10,7 @@ import numpy as np
 from replays.estimate.spectra import parabola_top
 from replays.plots.plot import Plot, Table, describe_title, kind, make_axes
 from replays.plots.signals import Signals
-from replays.plots.spectra import read_spectra
+from replays.plots.spectra import choose_window, read_spectra
 from replays.report.canvas import BLACK, BLUE, ORANGE, RED
 from rig.base.errors import InputError
 from rig.physics.kernels import signals as S
@@ -162,7 +162,7 @@ def _find_crossing(excess: Any, top_hz: float) -> float | None:
 def _find_peaks(signals: Signals, pair: str | None) -> np.ndarray:
     """Return speed and frequency of the peaks of the measured spectra, negative for backward, shape (n, 2) [Hz]."""
     probes, edges_s = signals.read_pair(pair), signals.edges_s
-    times_s, frequency, amplitude = read_spectra(signals, probes, None, None)
+    times_s, frequency, amplitude = read_spectra(signals, probes, None, choose_window(probes))
     speed_hz = np.zeros(len(times_s))
     if len(edges_s) > 1:
         speed_hz = np.interp(times_s, 0.5 * (edges_s[1:] + edges_s[:-1]), 1.0 / np.diff(edges_s))

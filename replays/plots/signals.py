@@ -40,7 +40,7 @@ Load = Callable[[str, float, float], Samples]
 
 
 _CACHE_BYTES = 100_000_000
-"""Size up to which earlier results of one kind are kept, beside the latest: all groups of some seconds."""
+"""Size up to which earlier results of one kind are kept in addition to the latest: all groups of some seconds."""
 
 
 class Cache:
@@ -155,7 +155,7 @@ _RULES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
         lambda value: _is_list(value, lambda one: _is_number(one, -1e6)) and len(value) == 2,
     ),
 }
-"""What an option must be, and a function that returns whether a value is."""
+"""Requirement of each option in words, and a function that returns whether a value meets it."""
 _REQUIRED = ("orders", "turns", "probe_angles_deg")
 """Options that cannot be None."""
 

@@ -17,8 +17,8 @@ from rig.channels.orbit import waterfall as compute_waterfall
 _SPECTRUM_S = 2.0
 """Length of the end of the data that a full spectrum shows by default [s]; its lines are 0.5 Hz apart."""
 _PADDING, _MAX_PADDED = 8, 1 << 19
-"""Lines per sample of a full spectrum, and most samples for so many. With one line per sample the peak of a frequency
-between two lines is up to 15 % too low, with eight 0.3 %; a long record has lines close to any frequency of a rotor."""
+"""Lines per sample of a full spectrum, and largest number of samples with more than one. With one line per sample the
+peak of a frequency between two lines is up to 15 % too low, with eight 0.3 %; a long record has close lines anyway."""
 _MAX_SPECTRA = 200
 """Largest number of spectra in a picture, about one per three pixels."""
 _CASCADE_LINES, _CASCADE_PEAK = 40, 6.0
@@ -246,14 +246,13 @@ def choose_window(probes: Pair) -> float:
 
 
 def read_spectra(
-    signals: Signals, probes: Pair, max_hz: float | None, window_s: float | None
+    signals: Signals, probes: Pair, max_hz: float | None, window_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times, frequencies and amplitudes of a pair's spectra, with nan at gaps.
 
     Raises:
         InputError: No part without a gap is as long as the window.
     """
-    window_s = choose_window(probes) if window_s is None else window_s
     return signals.recall("spectra", lambda: _compute_spectra(probes, max_hz, window_s), probes.name, max_hz, window_s)
 
 

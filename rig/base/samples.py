@@ -105,6 +105,10 @@ class Columns(Plottable):
         names, sizes, zeros = zip(*map(units.get_si_unit, self.units), strict=True) if self.units else ((), (), ())
         return cast(Self, replace(cast(Any, self), units=names, values=self.values * np.array(sizes) + np.array(zeros)))
 
+    def _find_times_s(self) -> np.ndarray | None:
+        """Return the time of each row [s]; None for rows without times, as of a spectrum."""
+        return getattr(self, "times_s", None)
+
     def to_pandas(self) -> pandas.DataFrame:
         """Return the rows as a DataFrame with a column per name over the simulated time; `attrs` has the units.
 
@@ -112,7 +116,7 @@ class Columns(Plottable):
             ModuleNotFoundError: pandas is not installed.
         """
         pandas = require_package("pandas", "notebook")
-        times_s = getattr(self, "times_s", None)
+        times_s = self._find_times_s()
         index = None if times_s is None else pandas.Index(times_s, name="time_s")
         frame = pandas.DataFrame(self.values, index=index, columns=list(self.names))
         frame.attrs["units"] = dict(zip(self.names, self.units, strict=True))
@@ -125,7 +129,7 @@ class Columns(Plottable):
             ModuleNotFoundError: xarray is not installed.
         """
         xarray = require_package("xarray", "notebook")
-        times_s = getattr(self, "times_s", None)
+        times_s = self._find_times_s()
         dimension = "row" if times_s is None else "time_s"
         columns = {
             name: (dimension, column, {"units": unit})
@@ -141,7 +145,7 @@ class Columns(Plottable):
             ModuleNotFoundError: pyarrow is not installed.
         """
         pyarrow = require_package("pyarrow", "notebook")
-        times_s = getattr(self, "times_s", None)
+        times_s = self._find_times_s()
         columns = [*zip(self.names, self.units, self.values.T, strict=True)]
         if times_s is not None:
             columns.insert(0, ("time_s", "s", times_s))

@@ -22,7 +22,7 @@ STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "
 SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
 DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
 WATCHED_S = 0.25
-"""Time over which the kind of motion is determined [s]: three revolutions of the shaft in backward whirl at 1 Hz."""
+"""Time over which the kind of motion is determined [s]: three turns of backward whirl at a spin of 1 Hz."""
 _CONTACT_SHARE = 0.95
 """Share of rows in contact from which the contact counts as lasting; losses of a few rows are waviness of the force."""
 _WATCHED = [COLUMN[name] for name in ("penetration", "ring_x", "ring_y")]
@@ -109,12 +109,11 @@ class MotionWatch:
         if touching >= _CONTACT_SHARE * len(contact):
             angle = np.unwrap(np.arctan2(y, x))
             turned = float(angle[-1] - angle[0]) * len(angle) / max(len(angle) - 1, 1)
-            kind = "resting"
-            if abs(turned) >= math.pi:
-                kind, whirl_hz = (
-                    "backward whirl" if turned < 0.0 else "forward whirl",
-                    turned / (2.0 * math.pi) / seconds,
-                )
+            if abs(turned) < math.pi:
+                kind = "resting"
+            else:
+                kind = "backward whirl" if turned < 0.0 else "forward whirl"
+                whirl_hz = turned / (2.0 * math.pi) / seconds
         elif touching:
             kind, impacts_hz = "impacts", int(np.count_nonzero(contact[1:] & ~contact[:-1])) / seconds
         return {"kind": kind, "whirl_hz": whirl_hz, "impacts_hz": impacts_hz}

@@ -105,7 +105,6 @@ def main() -> None:
         for name in given.names or NAMES:
             begin_s, cpu_s = time.monotonic(), time.process_time()
             tally = try_generated(interfaces, name, given.inputs, given.seed, CORPUS)
-            interfaces.end(name)
             hangs = sum(text.startswith(("hang", "too long")) for text in tally.faults)
             count = (tally.accepted + tally.refused) * interfaces[name].inputs
             peak_mb = max(peak_mb, tally.peak_mb)
@@ -117,6 +116,7 @@ def main() -> None:
                 flush=True,
             )
             failed |= bool(tally.faults)
+            interfaces.end(name)
     print(f"peak memory {peak_mb:.0f} MB")
     sys.exit(failed)
 

@@ -175,13 +175,12 @@ class Interfaces:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.end("can_lockstep")
+        self._stack.close()
 
     def end(self, name: str) -> None:
-        """End what an interface runs: a rig in lockstep that is not stepped for 300 s ends by itself."""
-        if name == "can_lockstep":
-            self._made.pop(name, None)
-            self._stack.close()
+        """End an interface with what it runs: a rig in lockstep that is not stepped for 300 s ends by itself."""
+        self._made.pop(name, None)
+        self._stack.close()
 
     def __getitem__(self, name: str) -> Interface:
         if name not in self._made:

@@ -44,7 +44,7 @@ BUDGETS = {
     "replays/sessions": 77,
     "replays/studies": 8981,
     "rig": 58,
-    "rig/base": 1046,
+    "rig/base": 1048,
     "rig/channels": 2452,
     "rig/cli": 5474,
     "rig/physics": 5486,

@@ -35,7 +35,7 @@ def plot(
 
     Each pair of probes, such as disk_x and disk_y, has a picture of each kind: orbit-disk.png, with its numbers in
     orbit-disk.csv. Plots that the data do not allow, such as a Bode plot at constant speed, are left out, with the
-    reason, unless --only names them. Existing files are replaced.
+    reason. Existing files are replaced.
     """
     from recorder.reader import join
     from replays.plots.methods import list_pictures
@@ -48,14 +48,12 @@ def plot(
     signals = read_signals(recording, from_s=from_s, to_s=to_s, runout=waveform)
     pictures, written = list_pictures(signals, split_names(only)), list[Path]()
     left_out: dict[tuple[str, str], tuple[list[str], InputError]] = {}
-    last: InputError | None = None
     with reporting() as reporter:
         reporter.begin(len(pictures))
         for name, draw in pictures.items():
             try:
                 drawn = draw()
             except InputError as error:
-                last = error
                 left_out.setdefault((error.field, error.must), ([], error))[0].append(name)
             else:
                 output.mkdir(exist_ok=True)
@@ -63,8 +61,8 @@ def plot(
                 written += drawn.save(path, table=".parquet" if parquet else ".csv", source=str(recording.path))
                 drawn.axes[0].figure.clear()  # frees its arrays now, not at a later garbage collection
             reporter.step(name)
-    if only and last is not None and not written:
-        raise last
+    if only and left_out and not written:
+        raise next(reversed(left_out.values()))[1]
     for path in written:
         echo(path)
     for names, reason in left_out.values():

@@ -121,11 +121,13 @@ def show_progress(text: str = "") -> Iterator[Callable[[float], None]]:
 
 def _is_live() -> bool:
     """Return whether stderr shows a live line: a terminal, or the output of a notebook's cell."""
+    if sys.stderr.isatty():
+        return True
     if "IPython" not in sys.modules:
-        return sys.stderr.isatty()
+        return False
     from rich.console import Console
 
-    return sys.stderr.isatty() or Console().is_jupyter
+    return Console().is_jupyter
 
 
 @contextmanager
