@@ -22,6 +22,7 @@ from rig.base.text import printable
 from rig.cli.command import Group, load_command, make_command, make_group, usage_error
 from rig.cli.output import provenance
 from rig.cli.output.tables import echo
+from rig.cli.signals import is_interrupted
 from rig.run.commands import SUMMARIES
 
 # The base class of typer's errors for wrong options and arguments. typer exports only this subclass of it.
@@ -192,6 +193,8 @@ def start(arguments: list[str] | None = None) -> None:
         # A full disk or a refusal by the file system is not a program error.
         _fail(f"{error.filename or 'the system'}: {error.strerror or error}", status=1)
     except BaseException as error:  # a library written in Rust may raise what is no Exception
+        if is_interrupted():
+            _fail("interrupted", status=_INTERRUPTED)
         if (shortage := describe_shortage(error)) is None:
             raise
         _fail(shortage, status=1)

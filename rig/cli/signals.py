@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 _ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """SIGHUP only if it is not ignored, as under nohup."""
+_AGAIN_S = 0.02
+"""Time until a swallowed interrupt is sent again [s]: the callback has returned."""
 _received: list[int] = []
 """Signals received before a handler was set; the code that the exception interrupts may swallow it."""
 
@@ -18,8 +23,26 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def is_interrupted() -> bool:
+    """Return whether a signal interrupted the command; a library may have turned the exception into another."""
+    return bool(_received)
+
+
+def _deliver_again(unraisable: Any) -> None:
+    """Send an interrupt again that a callback of a library swallowed, such as one of the compiler."""
+    if not isinstance(unraisable.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
+        return
+    import threading
+
+    again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), signal.SIGINT))
+    again.daemon = True
+    again.start()
+
+
 def listen() -> None:
     """Make the signals interrupt the command, until other handlers are set."""
+    sys.unraisablehook = _deliver_again
     for number in _ENDING:
         # A shell starts background jobs with SIGINT ignored; a SIGINT sent to one is deliberate.
         if number == signal.SIGINT or signal.getsignal(number) is signal.SIG_DFL:

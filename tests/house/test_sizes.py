@@ -46,7 +46,7 @@ BUDGETS = {
     "rig": 58,
     "rig/base": 1048,
     "rig/channels": 2452,
-    "rig/cli": 5474,
+    "rig/cli": 5492,
     "rig/physics": 5486,
     "rig/run": 1892,
     "rig/serve": 3019,
