@@ -296,7 +296,7 @@ def test_wrong_options_of_the_hub_are_refused_in_one_line(
     arguments: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
-        main(["can", "hub", *arguments])
+        main(["can", "hub", "--listen", free_endpoint(), *arguments])  # the pages of the docs use the default one
     output = "".join(capsys.readouterr())
     assert ended.value.code == 2
     assert line in output

@@ -104,10 +104,18 @@ def test_a_missing_key_folder_is_refused_with_its_source(server: ZenohServer, mo
 def test_a_client_waits_for_a_rig_that_starts_later() -> None:
     endpoint = free_endpoint()
     servers: list[ZenohServer] = []
-    timer = threading.Timer(0.7, lambda: servers.append(ZenohServer(endpoint)))
+    starts = threading.Event()
+
+    def start() -> None:
+        starts.set()
+        servers.append(ZenohServer(endpoint))  # a client may be linked before it returns
+
+    timer = threading.Timer(0.7, start)
     timer.start()
     try:
         with ZenohClient(endpoint, wait_s=20.0):
+            assert starts.is_set()
+            timer.join()
             assert len(servers) == 1
     finally:
         timer.join()
