@@ -11,7 +11,8 @@ KeyError that suggests similar ones. `rig.load_scene` checks a scene without
 running it, `rig.load_parameters` returns the parameters with their sources, and
 `rig.Simulation` advances step by step. `rig.full_spectrum`, `rig.waterfall`,
 `rig.whirl_frequency` and `rig.synchronous` (1X of a run-up) compute the usual
-rotordynamic plots from samples.
+rotordynamic plots from samples. `rig.ensemble` simulates a scene many times with
+varied values, and `rig.open_sweep` reads the runs of `rig sweep`.
 
 Recordings are opened by `recorder.reader.Recording`, with samples of the same
 type, and written by `replays.recordings.export.write_run`; `rig.connect`, which
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from rig.base.errors import InputError, UnknownNameError
     from rig.base.samples import Samples
     from rig.channels.orbit import full_spectrum, synchronous, waterfall, whirl_frequency
+    from rig.ensemble.ensemble import Ensemble, ensemble
+    from rig.ensemble.sweep import open_sweep
     from rig.physics.parameters import ParameterSet, load_parameters
     from rig.run.offline import Run, simulate
     from rig.run.scenes import Scene, load_scene
@@ -47,14 +50,16 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "InputError", "ParameterSet", "Run", "Samples", "Scene", "Simulation", "UnknownNameError", "connect",
-    "full_spectrum", "load_parameters", "load_scene", "open_session", "show_progress", "simulate", "synchronous",
-    "waterfall", "whirl_frequency",
+    "Ensemble", "InputError", "ParameterSet", "Run", "Samples", "Scene", "Simulation", "UnknownNameError", "connect",
+    "ensemble", "full_spectrum", "load_parameters", "load_scene", "open_session", "open_sweep", "show_progress",
+    "simulate", "synchronous", "waterfall", "whirl_frequency",
 ]  # fmt: skip
 
 find_our_modules()
 _HOMES = {
     "base.errors": ("InputError", "UnknownNameError"),
+    "ensemble.ensemble": ("Ensemble",),
+    "ensemble.sweep": ("open_sweep",),
     "run.offline": ("Run", "simulate"),
     "channels.orbit": ("full_spectrum", "synchronous", "waterfall", "whirl_frequency"),
     "physics.parameters": ("ParameterSet", "load_parameters"),
@@ -80,6 +85,8 @@ if not TYPE_CHECKING:  # a type checker uses the imports above
             if not Path(str(module.__file__)).resolve().is_relative_to(Path(PLACE, other.partition(".")[0]).resolve()):
                 raise ImportError(f"{other} must be the rig's own; received {module.__file__}; rename it")
             return getattr(module, name)
+        if name == "ensemble":
+            return import_module("rig.ensemble")  # a package that is called
         if name == "__version__":
             return metadata.version("rotor-stator-rig")
         home = next((home for home, names in _HOMES.items() if name in names), None)

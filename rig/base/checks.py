@@ -323,7 +323,7 @@ def _fields(models: list[type[BaseModel]], parts: tuple[str | int, ...]) -> list
         # The union member selected by the tag.
         tagged = (each for each in models if get_args(next(iter(each.model_fields.values())).annotation) == (part,))
         models = list(tagged) or models
-    return [name for each in models for name in each.model_fields]
+    return [field.alias or name for each in models for name, field in each.model_fields.items()]
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:

@@ -215,14 +215,51 @@ def _claim(draft: Path, path: Path) -> bool:
     return True
 
 
-def write_file(path: Path, data: str | bytes) -> None:
+def write_file(path: Path, data: str | bytes, *, sync: bool = False) -> None:
     """Write a file at once, text in UTF-8.
+
+    Args:
+        path: The file.
+        data: Its content.
+        sync: Have the disk store the content before the file gets its name, so that a power failure leaves no part.
 
     Raises:
         DiskError: The disk refused; an existing file stays unchanged.
     """
-    with whole_file(path) as draft:
-        draft.write_bytes(data.encode() if isinstance(data, str) else data)
+    with whole_file(path) as draft, open_output(draft, "wb") as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+        if sync:
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def lock_folder(folder: Path, what: str) -> int:
+    """Create a folder if necessary and lock it.
+
+    Args:
+        folder: The folder.
+        what: Kind of command that locks it, for errors.
+
+    Returns:
+        The handle that holds the lock until it is closed, or the process ends.
+
+    Raises:
+        DiskError: The folder cannot be created or opened.
+        InputError: Another process holds the lock.
+    """
+    import fcntl
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise DiskError(f"{folder}: {error.strerror}") from None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise InputError("--output", f"a folder that no other running {what} writes to", str(folder)) from None
+    return handle
 
 
 def open_output(path: Path, mode: str) -> IO[Any]:

@@ -79,6 +79,7 @@ COMMANDS = {
     },
     "Simulate offline": {
         "simulate": "Simulate a scene at full speed and write it to a file",
+        "sweep": "Simulate a scene many times with varied values",
         "bench": "Measure speed and error of the engines on this machine",
         "ladder": "Find the cheapest model, engine and step within a tolerance",
         "chart": "Chart speed against error",
@@ -111,7 +112,7 @@ GROUPS = {
 
 NEED_FULL = (
     "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
-    "score", "plot", "campaign", "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
+    "score", "plot", "campaign", "sessions", "simulate", "sweep", "bench", "ladder", "chart", "stability", "paper",
 )  # fmt: skip
 """Commands that a lean install lacks; of `keys` it has the subcommands."""
 

@@ -31,7 +31,6 @@ EXCEPTIONS = {
     "recorder/contents/consistency.py:_load_json": "values that are only compared; text that is not JSON has none",
     "recorder/viewer/canvas.py:piped": _LOCK,
     "recorder/files/unfinished_file.py": "keeps its file if it is interrupted; creates it exclusively",
-    "replays/campaigns/reporting/results.py:_lock_folder": _LOCK,
     "replays/campaigns/evidence.py": "moves files within its own folder, without links",
     "replays/campaigns/equipment/record.py": "the descriptor by which a recording is judged",
     "replays/campaigns/equipment/process.py": "the output of a device, without links",

@@ -57,6 +57,7 @@ EXCEPTIONS = {
     ("rig/channels/generators.py", SPECTRUM): "makes a signal of a given spectrum, and estimates nothing",
     ("rig/channels/orbit.py", SPECTRUM): "the one two-sided spectrum of an orbit, also for the recorder's viewer",
     ("rig/channels/orbit.py", SQUARES): "figures of an orbit, also for the recorder, which cannot import the replays",
+    ("rig/ensemble/axes.py", T): "draws values of a distribution that the user declares, and estimates nothing",
     ("rig/physics/accuracy.py", SQUARES): "a closed form below the replays",
     ("rig/physics/magnets.py", SQUARES): "coefficients of a force law below the replays",
     ("replays/estimate/intervals.py", SPECTRUM): "a cosine transform of 256 sums, by which a slow wander is found",

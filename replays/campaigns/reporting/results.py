@@ -21,8 +21,8 @@ from replays.campaigns.equipment.cleanup import find_containment
 from replays.report import junit, write_report
 from replays.studies.common import provenance
 from rig.base.checks import DOCUMENT_BYTES, StrictModel, check, read_json
-from rig.base.errors import DiskError, InputError
-from rig.base.files import build_read_error, read_file, write_file
+from rig.base.errors import InputError
+from rig.base.files import build_read_error, lock_folder, read_file, write_file
 from rig.base.text import printable, replace_nonfinite
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Results:
     def __init__(self, folder: Path, against: Sequence[Path], config: pytest.Config, *, force: bool = False) -> None:
         self._earlier = [load_results(each) for each in against]
         check_output(folder, force=force)
-        self._lock = _lock_folder(folder)
+        self._lock = lock_folder(folder, "campaign")
         self._folder, self._config = folder, config
         shutil.rmtree(folder / "evidence", ignore_errors=True)  # of the results that are overwritten
         self._cases: dict[str, dict[str, Any]] = {}
@@ -200,23 +200,6 @@ class Results:
         more += [("--limit", each) for each in self._config.getoption("rig_limit") or ()]
         options = [word for option, value in more if value for word in (option, value)]
         return shlex.join(["rig", "campaign", f"{file}{colons}{rest}", *options])
-
-
-def _lock_folder(folder: Path) -> int:
-    """Create a folder if necessary and lock it; return the handle that holds the lock."""
-    import fcntl
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise DiskError(f"{folder}: {error.strerror}") from None
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(handle)
-        raise InputError("--output", "a folder that no other running campaign writes to", str(folder)) from None
-    return handle
 
 
 def find_outcome(report: Any) -> str:
