@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 ALWAYS = ("outcome", "trusted", "engine")
 """Quantities that every table has."""
 _TASK_RUNS = 500
-_STEP_RUNS = 100
+_STEP_RUNS = 500
 """Runs between two looks at an interrupt."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -286,6 +287,7 @@ _MAPS = {"linear": linear_map, "map": fit_map, "cylinders": fit_cylinder_map}
 """Fit of the magnet map by level."""
 
 
+@lru_cache(maxsize=64)  # most parameters do not change it
 def _sag(shaft: Shaft, magnet: Magnet) -> float:
     """Return the height of the shaft at the ring at rest on the magnets [m], negative, by torque balance."""
 

@@ -47,8 +47,8 @@ BUDGETS = {
     "rig/base": 1064,
     "rig/channels": 2452,
     "rig/cli": 5586,
-    "rig/ensemble": 801,
-    "rig/physics": 5486,
+    "rig/ensemble": 1892,
+    "rig/physics": 5488,
     "rig/run": 1892,
     "rig/serve": 3019,
 }
