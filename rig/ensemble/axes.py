@@ -296,10 +296,11 @@ class Design:
 
     def values(self, first: int, last: int) -> np.ndarray:
         """Return the same, shape (last - first, keys): numbers, or objects if any value is a text."""
-        columns = self.columns(first, last)
-        table = np.empty(
-            (last - first, len(columns)), object if any(each.dtype == object for each in columns) else float
-        )
+        return self.stack(self.columns(first, last))
+
+    def stack(self, columns: list[np.ndarray]) -> np.ndarray:
+        """Return columns as one table: numbers, or objects if any value is a text."""
+        table = np.empty((len(columns[0]), len(columns)), np.result_type(*columns))
         for number, column in enumerate(columns):
             table[:, number] = column
         return table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -133,8 +134,7 @@ class Ensemble:
 
     def count_outcomes(self) -> dict[str, int]:
         """Return the number of runs by outcome, the most frequent first."""
-        names, counts = np.unique(self["outcome"].astype(str), return_counts=True)
-        return {str(names[place]): int(counts[place]) for place in np.argsort(-counts, kind="stable")}
+        return dict(Counter(self.table["outcome"].to_pylist()).most_common())
 
     def _describe(self) -> Iterator[tuple[str, ...]]:
         for name in self.names:
@@ -195,20 +195,21 @@ def simulate_runs(
     import pyarrow
 
     batch = Batch(scene, design.keys, early_end=early_end)
-    parts = []
-    for begin in range(first, last, _STEP_RUNS):
+    inputs, parts = design.columns(first, last), []
+    values = design.stack(inputs)
+    for begin in range(0, last - first, _STEP_RUNS):
         if stop is not None and stop.is_set():
             raise CancelledError
-        parts.append(batch.run(design.values(begin, min(begin + _STEP_RUNS, last))))
+        parts.append(batch.run(values[begin : begin + _STEP_RUNS]))
     columns: dict[str, tuple[str, Any]] = {"run": ("", np.arange(first, last))}
-    for key, values in zip(design.keys, design.columns(first, last), strict=True):
+    for key, column in zip(design.keys, inputs, strict=True):
         is_text = any(isinstance(each, str) for each in design.axes[key].values or ())
-        columns[key] = (design.bounds[key].unit, [str(each) for each in values] if is_text else values)
+        columns[key] = (design.bounds[key].unit, [str(each) for each in column] if is_text else column)
     columns.setdefault("seed", ("", design.seeds(first, last)))
     for name in quantities:
-        values = np.concatenate([part[name] for part in parts])
-        columns[name] = (QUANTITIES[name].unit, values.astype(object) if values.dtype.kind == "U" else values)
-    arrays = {name: pyarrow.array(values) for name, (_, values) in columns.items()}
+        column = np.concatenate([part[name] for part in parts])
+        columns[name] = (QUANTITIES[name].unit, column.astype(object) if column.dtype.kind == "U" else column)
+    arrays = {name: pyarrow.array(column) for name, (_, column) in columns.items()}
     fields = [pyarrow.field(name, array.type, metadata={"unit": columns[name][0]}) for name, array in arrays.items()]
     return pyarrow.Table.from_arrays([*arrays.values()], schema=pyarrow.schema(fields))
 

@@ -20,6 +20,9 @@ from rig.run.scenes import Scene, load_scene, parse_scene, scene_document, scene
 _PACKAGES = ("rotor-stator-rig", "numpy", "scipy", "numba", "pyarrow")
 """Packages that determine the bytes of a part."""
 
+_AXIS_FIELDS = {"values", "from", "to", "scale", "distribution", "mean", "std"}
+"""Fields of an axis that are no part of a key, as count is of magnet.count."""
+
 
 class Plan(Written):
     """Content of a plan file."""
@@ -76,13 +79,11 @@ def find_versions() -> dict[str, str]:
 
 
 def flatten(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return a table of axes by dotted key; the key is written in quotes, or as nested tables."""
+    """Return a table of axes by dotted key; a key is written in quotes, or as nested tables."""
     flat: dict[str, Any] = {}
     for name, value in table.items():
-        if isinstance(value, dict) and value and all(isinstance(each, dict) for each in value.values()):
-            flat |= flatten(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
+        is_axis = not isinstance(value, dict) or not value or _AXIS_FIELDS & value.keys()
+        flat |= {prefix + name: value} if is_axis else flatten(value, f"{prefix}{name}.")
     return flat
 
 

@@ -206,7 +206,8 @@ REFUSED_PLANS = {
     'scene = "hammer"\n[set]\n"contact.frction" = 1\n[over."contact.friction"]\nvalues = [0.1]': "contact.frction must",
     'scene = "hammer"\n[over."contact.friction"]\nvalues = []': "over.contact.friction.values must be a list of",
     'scene = "hammer"\n[over.contact.friction]\nvalues = [9]': "over.contact.friction must be a number",
-    'scene = "hammer"\n[over.contact]\nfriction = [0.1]': "over.contact.friction must be a known field",
+    'scene = "hammer"\n[over.contact]\nfriction = [9]': "over.contact.friction must be a number from 0 to 2",
+    'scene = "hammer"\n[over.magnet]\ncount = [2]': "over.magnet.count must be a whole number from 3 to 64; received 2",
     'scene = "test-quiet"\n[over."contact.friction"]\nvalues = [0.1]': "scene must be one of the physics",
     """scene = "hammer"
     [set]
