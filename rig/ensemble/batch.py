@@ -164,6 +164,20 @@ class _Prepared(NamedTuple):
     supported: bool
 
 
+def _prepare(scene: Scene, model: Model) -> _Prepared:
+    """Prepare a run.
+
+    Raises:
+        InputError: The shaft would not be in the ring at the start.
+    """
+    plan = _Plan(scene, model)
+    state = initial_state(model, scene.initial, None, spin=plan.speed)
+    initial = np.zeros(L.N_START)
+    initial[:4] = axis_from_angles(model.constants.levels.euler, *state[[0, 1, 7, 8]])
+    initial[L.SPIN], initial[L.THETA] = state[9], state[2]
+    return _Prepared(scene, _constants_row(model), initial, plan.rows, _is_supported(scene, model))
+
+
 class Batch:
     """Runs of one scene that differ in the values of some keys.
 
@@ -173,7 +187,7 @@ class Batch:
         early_end: Whether a run ends when its outcome is certain.
 
     Raises:
-        InputError: A key cannot be varied.
+        InputError: A key cannot be varied, or the scene cannot start.
 
     Example:
         >>> import rig
@@ -188,6 +202,7 @@ class Batch:
         self.scene, self.keys, self._early = scene, tuple(keys), early_end
         self._parameters = scene.load_parameters()
         self._model = build_model(self._parameters, scene.model)
+        self._own = _prepare(scene, self._model)
         self._direct: dict[int, tuple[int, bool, float]] = {}
         self._indirect: list[int] = []
         for position, key in enumerate(self.keys):
@@ -248,49 +263,56 @@ class Batch:
                 )
         return vary(scene, others) if others else scene
 
-    def _prepare_run(self, values: tuple[Any, ...]) -> _Prepared:
-        """Prepare a run from the values of the keys that are not single constants."""
+    def _prepare_run(self, values: tuple[Any, ...]) -> _Prepared | None:
+        """Prepare a run from the values of the keys that are not single constants; None if it cannot start."""
         changes = dict(zip([self.keys[position] for position in self._indirect], values, strict=True))
         parameters = {key: value for key, value in changes.items() if key in self._parameters.entries}
-        others = {key: value for key, value in changes.items() if key not in parameters}
-        scene = self._change_scene(others)
+        scene = self._change_scene({key: value for key, value in changes.items() if key not in parameters})
         if parameters:
             scene = scene.model_copy(update={"set": {**scene.set, **parameters}})
-        model = self._build_model(tuple(parameters.items()), scene.model)
-        plan = _Plan(scene, model)
-        state = initial_state(model, scene.initial, None, spin=plan.speed)
-        initial = np.concatenate([axis_from_angles(model.constants.levels.euler, *state[[0, 1, 7, 8]]), np.zeros(10)])
-        initial[L.SPIN], initial[L.THETA] = state[9], state[2]
-        return _Prepared(scene, _constants_row(model), initial, plan.rows, _is_supported(scene, model))
+        try:
+            return _prepare(scene, self._build_model(tuple(parameters.items()), scene.model))
+        except InputError:
+            return None
 
-    def run(self, values: Any, *, check: bool = False, repeat: bool = True) -> dict[str, np.ndarray]:
+    def run(
+        self, values: Any, *, check: bool = False, repeat: bool = True, start: np.ndarray | None = None
+    ) -> dict[str, np.ndarray]:
         """Run the batch.
 
         Args:
             values: Values of the keys, shape (n, keys): numbers in the units of the scene or parameter, or texts.
             check: Whether to repeat each run with a finer tolerance, for `error_estimate`.
             repeat: Whether to repeat runs that cannot be trusted with the scene's engine.
+            start: States in which the runs start, the `end` of other runs; default: those of the scene.
 
         Returns:
-            Quantities by name, each of shape (n,).
+            Quantities by name, each of shape (n,), and the state at the `end`, shape (n, N_START). A run that the
+            scene does not accept, as its shaft would not be in the ring, has failed.
 
         Raises:
             InputError: A value is not accepted.
         """
         rows = np.asarray(values, dtype=object if isinstance(values, list) else None).reshape(-1, len(self.keys))
-        prepared = [self._prepare(tuple(row[self._indirect].tolist())) for row in rows]
-        table = self._run_lanes(rows, prepared, TOLERANCE)
-        if check and len(rows):
-            _compare(table, self._run_lanes(rows, prepared, TOLERANCE * _CHECK_FACTOR))
-        for i, each in enumerate(prepared):
-            if each.supported and (table["trusted"][i] or not repeat):
+        found = [self._prepare(tuple(row[self._indirect].tolist())) for row in rows]
+        prepared = [each or self._own for each in found]
+        table = self._run_lanes(rows, prepared, TOLERANCE, start)
+        if check and len(prepared):
+            _compare(table, self._run_lanes(rows, prepared, TOLERANCE * _CHECK_FACTOR, start))
+        for i, each in enumerate(found):
+            if each is None:
+                table["outcome"][i], table["trusted"][i] = "failed", False
+                continue
+            if each.supported and (table["trusted"][i] or not repeat or start is not None):
                 continue
             direct = {self.keys[position]: rows[i, position] for position in self._direct}
             for name, value in self._run_engine(each.scene, direct, repeats=each.supported).items():
                 table[name][i] = value
         return table
 
-    def _run_lanes(self, rows: np.ndarray, prepared: list[_Prepared], tolerance: float) -> dict[str, np.ndarray]:
+    def _run_lanes(
+        self, rows: np.ndarray, prepared: list[_Prepared], tolerance: float, start: np.ndarray | None
+    ) -> dict[str, np.ndarray]:
         """Run all with the batch kernel, also those that it does not support, whose results are replaced."""
         count = len(rows)
         constants = np.array([each.constants for each in prepared]).reshape(count, L.N_CONSTANTS)
@@ -302,9 +324,11 @@ class Batch:
         schedule = np.full((count, longest, 1 + L.N_INPUTS), math.inf)
         for i, each in enumerate(prepared):
             schedule[i, : len(each.schedule)] = each.schedule
-        initial = np.array([each.initial for each in prepared]).reshape(count, L.N_STATE)
+        initial = np.array([each.initial for each in prepared]).reshape(count, L.N_START)
         ends = np.array([each.scene.duration_s for each in prepared])
-        _set_free_motion(constants, initial, prepared)
+        if start is not None:
+            initial = np.array(start, dtype=float).reshape(count, L.N_START)
+        _set_free_motion(constants, prepared)
         results = np.zeros((count, L.N_RESULTS))
         watched = np.minimum(WATCHED_S, _WATCHED_SHARE * ends)
         if count:
@@ -346,7 +370,7 @@ _COLUMNS = [
 _PER_SCALE = 1.0 / np.array([*STATE_SCALE[[1, 0, 8, 7, 9, 2, 3, 4, 5, 6, 10, 11, 12, 13]], *_OWN_SCALES])
 
 
-def _set_free_motion(constants: np.ndarray, initial: np.ndarray, prepared: list[_Prepared]) -> None:
+def _set_free_motion(constants: np.ndarray, prepared: list[_Prepared]) -> None:
     """Set the constants that decide whether a run stays free, from the linear motion about the rest position.
 
     The magnets harden, so that their stiffness at the centre gives the lower frequency and the larger amplitude. The
@@ -403,6 +427,7 @@ def _quantities(results: np.ndarray) -> dict[str, np.ndarray]:
         "dissipated_j": r[L.DISSIPATED].copy(),
         "error_estimate": np.full(len(results), np.nan),
         "steps": r[L.STEPS].copy(),
+        "end": r[L.END_STATE :].T.copy(),
     }
 
 

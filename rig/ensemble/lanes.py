@@ -34,6 +34,8 @@ TIME, ROOT, IMPULSE, WORK, LOSS = range(14, 19)
 """Time [s]; root of the penetration [m^0.5]; integral of the normal force [N s]; supplied less dissipated energy [J];
 dissipated energy [J]."""
 N_STATE, N_VECTOR = 14, 19
+N_START = N_STATE + 2
+"""Numbers that a run starts from: state, contact phase, impact speed of the contact [m/s]."""
 
 # Constants of a run; reciprocals where the equations divide.
 (
@@ -65,15 +67,15 @@ _Z = _Y + N_VECTOR
 _C = _Z + N_VECTOR
 _EVALUATION = _C + _RUN_ROWS
 _H = _EVALUATION + _N_EVALUATION
-_K = _H + N_VECTOR
+_D = _H + N_VECTOR
+_K = _D + N_VECTOR
 _SCRATCH = _K + 13 * N_VECTOR
 _ROWS = _SCRATCH + 2 * (ROOT + 1)
-"""First rows of: state, state of a stage, constants, results of an evaluation, step length (repeated), rates of the
-stages, error estimates."""
+"""First rows of: state, state of a stage, constants, results of an evaluation, step length (repeated), rates,
+rates of the stages, error estimates."""
 _STAGE, _SIZE = (ROOT + 1) * LANES, N_VECTOR * LANES
 """Numbers of a stage's state, without the integrals that nothing depends on; of the whole vector."""
 _K0, _K1, _K2, _K3, _K4, _K5, _K6, _K7, _K8, _K9, _K10, _K11, _K12 = range(_K * LANES, _SCRATCH * LANES, _SIZE)
-_D = _K12 // LANES
 
 FLIGHT, FREE_SLIDING, FORWARD, BACKWARD, ROLLING = range(5)
 """Contact phases, as in `rig.physics.kernels.laws.contact`; FREE_SLIDING is contact without friction."""
@@ -82,9 +84,9 @@ FLIGHT, FREE_SLIDING, FORWARD, BACKWARD, ROLLING = range(5)
 (
     STATUS, END, CONTACTS, FIRST_CONTACT, LAST_CONTACT, CONTACT_TIME, WHIRL_TIME, PEAK_FORCE, PEAK_RADIUS, PEAK_X,
     PEAK_Y, CONTACT_IMPULSE, RESIDUAL, DISSIPATED, STEPS, REPEATED, TURNED, WATCHED_CONTACT, WATCHED_TURN,
-    WATCHED, END_PHASE, END_STATE,
-) = range(22)  # fmt: skip
-N_RESULTS = END_STATE + N_STATE
+    WATCHED, END_STATE,
+) = range(21)  # fmt: skip
+N_RESULTS = END_STATE + N_START
 UNFINISHED, RAN, STAYS_FREE, STAYS_WHIRLING, GIVEN_UP = range(5)
 """Status of a run: not finished; reached its end; ended early, as it stays free or in backward whirl; given up after
 too many steps, or numbers that are not finite."""
@@ -95,8 +97,8 @@ _PER_QUARTER, _QUARTER_HIGH, _QUARTER_LOW = 2.0 / math.pi, 1.5707963267948966, 6
 _MAX_STEP = 2e-3
 """Longest step [s]: a tenth of a turn at 50 Hz."""
 _MIN_STEP = 1e-13
-_MAX_STEPS = 60_000
-"""Steps after which a run is given up: a hammer run of 0.25 s takes about 1,500."""
+_MAX_STEPS = 400_000
+"""Steps after which a run is given up: a hammer run of 0.25 s takes 1,500, one of 3 s with much damping 150,000."""
 _WHIRL_TURNS = 3.0
 _WHIRL_MARGIN = 0.85
 _MAX_LOCATIONS = 40
@@ -145,8 +147,8 @@ def _positive(x):
 
 
 @njit(cache=True, error_model="numpy", fastmath=False)
-def evaluate(m, rates):
-    """Compute the rates of all lanes at the state at `_Z` into `rates`, and what events need.
+def evaluate(m):
+    """Compute the rates of all lanes at the state at `_Z` into `_D`, and what events need.
 
     The body has no calls and no branches with effects: the compiler turns each line into one instruction for all lanes.
     """
@@ -240,7 +242,7 @@ def evaluate(m, rates):
         losses += (Fn - elastic) * rate + Ft * sliding
         supplied = torque * w + lI * (disk_x * px + disk_y * py)
         speed = root if slowed != 0.0 else 1.0
-        d = rates + i
+        d = _D * LANES + i
         m[d + UX * LANES], m[d + UY * LANES] = speed * px, speed * py
         m[d + PX * LANES], m[d + PY * LANES] = speed * ddx, speed * ddy
         m[d + SPIN * LANES], m[d + THETA * LANES] = speed * spin_rate, speed * theta_rate
@@ -281,100 +283,105 @@ _NO_EVENT, _ONSET, _LIFT_OFF, _STICK, _SLIP, _CORNER_EVENT = range(6)
 # fmt: off: the terms of a sum fill the lines.
 @njit(cache=True, error_model="numpy", fastmath=False)
 def _take_step(m):
-    """Take one step in all lanes, from the state at `_Y` with its rates at `_K0`, to `_Z` with its rates at `_K12`.
+    """Take one step in all lanes, from the state at `_Y` with its rates at `_K0`, to `_Z` with its rates at `_D`.
 
     Literal positions let the compiler see that the rows do not overlap, and so vectorise each loop.
     """
     y, z, h = _Y * LANES, _Z * LANES, _H * LANES
     for i in range(LANES):
         m[(_EVALUATION + WORST) * LANES + i] = -math.inf
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (_A[1][0] * m[_K0 + n])
-    evaluate(m, _K1)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (_A[2][0] * m[_K0 + n] + _A[2][1] * m[_K1 + n])
-    evaluate(m, _K2)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (_A[3][0] * m[_K0 + n] + _A[3][2] * m[_K2 + n])
-    evaluate(m, _K3)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (_A[4][0] * m[_K0 + n] + _A[4][2] * m[_K2 + n] + _A[4][3] * m[_K3 + n])
-    evaluate(m, _K4)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (_A[5][0] * m[_K0 + n] + _A[5][3] * m[_K3 + n] + _A[5][4] * m[_K4 + n])
-    evaluate(m, _K5)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (
-            _A[6][0] * m[_K0 + n] + _A[6][3] * m[_K3 + n] + _A[6][4] * m[_K4 + n] + _A[6][5] * m[_K5 + n]
-        )
-    evaluate(m, _K6)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (
-            _A[7][0] * m[_K0 + n]
-            + _A[7][3] * m[_K3 + n]
-            + _A[7][4] * m[_K4 + n]
-            + _A[7][5] * m[_K5 + n]
-            + _A[7][6] * m[_K6 + n]
-        )
-    evaluate(m, _K7)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (
-            _A[8][0] * m[_K0 + n]
-            + _A[8][3] * m[_K3 + n]
-            + _A[8][4] * m[_K4 + n]
-            + _A[8][5] * m[_K5 + n]
-            + _A[8][6] * m[_K6 + n]
-            + _A[8][7] * m[_K7 + n]
-        )
-    evaluate(m, _K8)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (
-            _A[9][0] * m[_K0 + n]
-            + _A[9][3] * m[_K3 + n]
-            + _A[9][4] * m[_K4 + n]
-            + _A[9][5] * m[_K5 + n]
-            + _A[9][6] * m[_K6 + n]
-            + _A[9][7] * m[_K7 + n]
-            + _A[9][8] * m[_K8 + n]
-        )
-    evaluate(m, _K9)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (
-            _A[10][0] * m[_K0 + n]
-            + _A[10][3] * m[_K3 + n]
-            + _A[10][4] * m[_K4 + n]
-            + _A[10][5] * m[_K5 + n]
-            + _A[10][6] * m[_K6 + n]
-            + _A[10][7] * m[_K7 + n]
-            + _A[10][8] * m[_K8 + n]
-            + _A[10][9] * m[_K9 + n]
-        )
-    evaluate(m, _K10)
-    for n in range(_STAGE):
-        m[z + n] = m[y + n] + m[h + n] * (
-            _A[11][0] * m[_K0 + n]
-            + _A[11][3] * m[_K3 + n]
-            + _A[11][4] * m[_K4 + n]
-            + _A[11][5] * m[_K5 + n]
-            + _A[11][6] * m[_K6 + n]
-            + _A[11][7] * m[_K7 + n]
-            + _A[11][8] * m[_K8 + n]
-            + _A[11][9] * m[_K9 + n]
-            + _A[11][10] * m[_K10 + n]
-        )
-    evaluate(m, _K11)
-    for n in range(_SIZE):
-        m[z + n] = m[y + n] + m[h + n] * (
-            _B[0] * m[_K0 + n]
-            + _B[5] * m[_K5 + n]
-            + _B[6] * m[_K6 + n]
-            + _B[7] * m[_K7 + n]
-            + _B[8] * m[_K8 + n]
-            + _B[9] * m[_K9 + n]
-            + _B[10] * m[_K10 + n]
-            + _B[11] * m[_K11 + n]
-        )
-    evaluate(m, _K12)
+    for stage in range(1, 13):
+        if stage == 1:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (_A[1][0] * m[_K0 + n])
+        elif stage == 2:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (_A[2][0] * m[_K0 + n] + _A[2][1] * m[_K1 + n])
+        elif stage == 3:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (_A[3][0] * m[_K0 + n] + _A[3][2] * m[_K2 + n])
+        elif stage == 4:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (_A[4][0] * m[_K0 + n] + _A[4][2] * m[_K2 + n] + _A[4][3] * m[_K3 + n])
+        elif stage == 5:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (_A[5][0] * m[_K0 + n] + _A[5][3] * m[_K3 + n] + _A[5][4] * m[_K4 + n])
+        elif stage == 6:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (
+                    _A[6][0] * m[_K0 + n] + _A[6][3] * m[_K3 + n] + _A[6][4] * m[_K4 + n] + _A[6][5] * m[_K5 + n]
+                )
+        elif stage == 7:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (
+                    _A[7][0] * m[_K0 + n]
+                    + _A[7][3] * m[_K3 + n]
+                    + _A[7][4] * m[_K4 + n]
+                    + _A[7][5] * m[_K5 + n]
+                    + _A[7][6] * m[_K6 + n]
+                )
+        elif stage == 8:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (
+                    _A[8][0] * m[_K0 + n]
+                    + _A[8][3] * m[_K3 + n]
+                    + _A[8][4] * m[_K4 + n]
+                    + _A[8][5] * m[_K5 + n]
+                    + _A[8][6] * m[_K6 + n]
+                    + _A[8][7] * m[_K7 + n]
+                )
+        elif stage == 9:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (
+                    _A[9][0] * m[_K0 + n]
+                    + _A[9][3] * m[_K3 + n]
+                    + _A[9][4] * m[_K4 + n]
+                    + _A[9][5] * m[_K5 + n]
+                    + _A[9][6] * m[_K6 + n]
+                    + _A[9][7] * m[_K7 + n]
+                    + _A[9][8] * m[_K8 + n]
+                )
+        elif stage == 10:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (
+                    _A[10][0] * m[_K0 + n]
+                    + _A[10][3] * m[_K3 + n]
+                    + _A[10][4] * m[_K4 + n]
+                    + _A[10][5] * m[_K5 + n]
+                    + _A[10][6] * m[_K6 + n]
+                    + _A[10][7] * m[_K7 + n]
+                    + _A[10][8] * m[_K8 + n]
+                    + _A[10][9] * m[_K9 + n]
+                )
+        elif stage == 11:
+            for n in range(_STAGE):
+                m[z + n] = m[y + n] + m[h + n] * (
+                    _A[11][0] * m[_K0 + n]
+                    + _A[11][3] * m[_K3 + n]
+                    + _A[11][4] * m[_K4 + n]
+                    + _A[11][5] * m[_K5 + n]
+                    + _A[11][6] * m[_K6 + n]
+                    + _A[11][7] * m[_K7 + n]
+                    + _A[11][8] * m[_K8 + n]
+                    + _A[11][9] * m[_K9 + n]
+                    + _A[11][10] * m[_K10 + n]
+                )
+        else:
+            for n in range(_SIZE):
+                m[z + n] = m[y + n] + m[h + n] * (
+                    _B[0] * m[_K0 + n]
+                    + _B[5] * m[_K5 + n]
+                    + _B[6] * m[_K6 + n]
+                    + _B[7] * m[_K7 + n]
+                    + _B[8] * m[_K8 + n]
+                    + _B[9] * m[_K9 + n]
+                    + _B[10] * m[_K10 + n]
+                    + _B[11] * m[_K11 + n]
+                )
+        evaluate(m)  # the only call: the compiler would insert the function at each of several
+        into = m[_K0 + stage * _SIZE :]
+        for n in range(_SIZE):
+            into[n] = m[_D * LANES + n]
 
 
 @njit(cache=True, error_model="numpy", fastmath=False)
@@ -424,11 +431,20 @@ def _evaluate_start(m, own):
     """
     for n in range(_SIZE):
         m[_Z * LANES + n] = m[_Y * LANES + n]
-    evaluate(m, _K12)
+    evaluate(m)
     for i in range(LANES):
         if own[_CHANGED, i] != 0.0:
             for n in range(i, _SIZE, LANES):
-                m[_K0 + n] = m[_K12 + n]
+                m[_K0 + n] = m[_D * LANES + n]
+
+
+@njit(cache=True, error_model="numpy", fastmath=False)
+def _depth(m, i):
+    """Return the penetration of a lane's shaft into the ring [m], at least 1e-14 m."""
+    y, c = _Y * LANES + i, _C * LANES + i
+    ex = m[c + ARM_RING * LANES] * m[y + UX * LANES] - m[y + X_IH * LANES] - m[c + OFFSET_X * LANES]
+    ey = m[c + ARM_RING * LANES] * m[y + UY * LANES] - m[y + Y_IH * LANES] - m[c + OFFSET_Y * LANES]
+    return max(1e-14, math.sqrt(ex * ex + ey * ey) - m[c + CLEARANCE * LANES])
 
 
 @njit(cache=True, error_model="numpy", fastmath=False)
@@ -453,9 +469,7 @@ def _energy(m, i):
         change = 0.5 * stiffness * (m[y + Y_IH * LANES] - y_oh if pair == 0 else x_oh)
         first, second = max(0.0, preload + change), max(0.0, preload - change)
         total += (first * first + second * second - 2.0 * preload * preload) / stiffness
-    ex = m[c + ARM_RING * LANES] * ux - m[y + X_IH * LANES] - m[c + OFFSET_X * LANES]
-    ey = m[c + ARM_RING * LANES] * uy - m[y + Y_IH * LANES] - m[c + OFFSET_Y * LANES]
-    depth = max(0.0, math.sqrt(ex * ex + ey * ey) - m[c + CLEARANCE * LANES])
+    depth = _depth(m, i)
     return total + m[c + TOUCHING * LANES] * 0.4 * m[c + STIFFNESS * LANES] * depth * depth * math.sqrt(depth)
 
 
@@ -505,11 +519,15 @@ def _load_run(m, own, i, run, batch, result):
         m[c + (N_CONSTANTS + n) * LANES] = schedule[run, 0, 1 + n]
     for n in range(N_VECTOR):
         m[y + n * LANES] = initial[run, n] if n < N_STATE else 0.0
-    m[c + ONSET * LANES] = m[c + SPEED_FLOOR * LANES]
+    phase, m[c + ONSET * LANES] = initial[run, N_STATE], max(initial[run, N_STATE + 1], m[c + SPEED_FLOOR * LANES])
     for n in range(_N_LANE):
         own[n, i] = 0.0
     own[_RUN, i], own[_STEP, i], own[_CHANGED, i] = run, 1e-5, 1.0
-    _set_phase(m, own, i, FLIGHT)
+    if phase != FLIGHT:
+        own[_TRIES, i] = 1.0 if phase == ROLLING else 0.0
+        own[_TAU_STEP, i] = 1e-5 / math.sqrt(_depth(m, i))
+        m[y + ROOT * LANES] = math.sqrt(_depth(m, i))
+    _set_phase(m, own, i, phase)
     own[_START_ENERGY, i] = _energy(m, i)
     for n in range(N_RESULTS):
         result[i, n] = 0.0
@@ -826,9 +844,9 @@ def _finish(m, own, i, status, result):
         change = 0.5 * m[c + (PAIR_VERTICAL + pair) * LANES] * mine[PEAK_Y - pair]
         mine[PEAK_Y - pair] = change + min(change, m[c + PRELOAD * LANES])
     mine[PEAK_RADIUS] = math.sqrt(mine[PEAK_RADIUS])
-    mine[END_PHASE] = own[_PHASE, i]
     for n in range(N_STATE):
         mine[END_STATE + n] = m[y + n * LANES]
+    mine[END_STATE + N_STATE], mine[END_STATE + N_STATE + 1] = own[_PHASE, i], m[c + ONSET * LANES]
     if own[_PHASE, i] != FLIGHT:
         mine[LAST_CONTACT] = now
     if own[_PHASE, i] == ROLLING:
@@ -929,7 +947,7 @@ def march(batch, per_scale, tolerance, early, results):
     """Run a batch to the end, and write its results.
 
     Args:
-        batch: Constants, shape (n, N_CONSTANTS); initial states, shape (n, N_STATE); schedules, shape (n, k, 1 +
+        batch: Constants, shape (n, N_CONSTANTS); starts, shape (n, N_START); schedules, shape (n, k, 1 +
             N_INPUTS), each row an instant [s] and the inputs from then on, unused rows at infinity; ends [s], shape
             (n,); lengths of the watch before the end [s], shape
             (n,).

@@ -88,8 +88,8 @@ def test_the_rates_are_those_of_the_model(phase: int, shaft: str) -> None:
             speed * (supplied - losses),
             speed * losses,
         ]
-    L.evaluate(m, L._K0)
-    computed = m[L._K0 : L._K0 + L._SIZE].reshape(L.N_VECTOR, L.LANES)
+    L.evaluate(m)
+    computed = rows[L._D : L._D + L.N_VECTOR]
     scale = np.abs(expected).max(axis=1, keepdims=True) + 1e-12
     assert np.abs(computed - expected).max() > 0.0  # two independent ways
     np.testing.assert_allclose(computed / scale, expected / scale, atol=2e-9 if phase != FLIGHT else 1e-11)
@@ -209,3 +209,26 @@ def test_a_speed_command_and_a_release_take_effect_at_their_instants() -> None:
     assert lanes["trusted"][0]
     assert lanes["first_contact_s"][0] == pytest.approx(engine["first_contact_s"][0], abs=1e-4)
     np.testing.assert_allclose(lanes["peak_force_n"], engine["peak_force_n"], rtol=0.05)
+
+
+def test_runs_continue_from_the_end_of_others() -> None:
+    scene = rig.load_scene("hammer", {"duration_s": 0.3})
+    whirling = Batch(scene, ["drive.speed_hz"], early_end=False).run([[6.2], [6.2], [6.2]])
+    assert whirling["outcome"].tolist() == ["backward whirl"] * 3
+    still = Batch(rig.load_scene("stable-run", {"duration_s": 0.6}), ["drive.speed_hz", "contact.friction"])
+    values = [[6.2, 0.25], [5.5, 0.25], [6.2, 0.002]]
+    from_rest = still.run(values)
+    assert from_rest["outcome"].tolist() == ["free"] * 3
+    continued = still.run(values, start=whirling["end"])
+    assert continued["outcome"].tolist() == ["backward whirl", "backward whirl", "impacts"]
+    assert continued["trusted"].all()
+    assert continued["whirl_hz"][0] == pytest.approx(whirling["whirl_hz"][0], rel=0.02)
+
+
+def test_a_run_that_cannot_start_has_failed_alone() -> None:
+    scene = rig.load_scene("hammer", {"duration_s": 0.1})
+    table = Batch(scene, ["ring.offset_x"]).run([[0.0], [5.0]])
+    assert table["outcome"].tolist()[1] == "failed"
+    assert table["trusted"].tolist() == [True, False]
+    with pytest.raises(rig.InputError, match=r"ring\.offset must be within"):
+        Batch(rig.load_scene("hammer", {"ring.offset_x": 5.0}), ["contact.friction"])
