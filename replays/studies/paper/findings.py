@@ -152,7 +152,7 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
     results = {name: done[a:b] for name, (a, b) in zip(groups, pairwise(ends.tolist()), strict=True)}
     starts = []
     for force in _forces(quick=quick):
-        starts.append(condition.start_by_pulse(force, points=12 if quick else 39))
+        starts.append(condition.start_by_pulse(force, points=12 if quick else 77))
         report(f"friction over a pulse of {force:g} N")
     slowest = condition.start_thresholds((0.08, 0.25)) if quick else condition.start_thresholds()
     report("slowest whirl that friction keeps up")

@@ -19,10 +19,11 @@ from typing import NamedTuple
 import numpy as np
 
 from replays.studies.ladder.quantity import find_rolling_start
-from replays.studies.paper.scans.pulse import Pulse, PulseRun
-from replays.studies.stability.trials.boundary import NAMES, ROLLING, whirl_class
+from replays.studies.paper.scans.pulse import Pulse, PulseRun, pulse_scene
+from replays.studies.stability.trials.boundary import BOUNCING, FREE, NAMES, ROLLING, SLIDING
 from replays.studies.stability.trials.motion import base_model, move, pivoted_mass, quiet_inputs, state
 from rig.channels.orbit import phase, whirl_frequency
+from rig.ensemble.batch import Batch
 from rig.physics.kernels.constants import Constants
 from rig.physics.levels import ModelLevels
 
@@ -32,6 +33,7 @@ FRICTIONS = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35)
 SPINS_HZ = (3.2, 6.2, 9.0)
 """Spins for which the least sustaining friction is computed [Hz]."""
 _TICKS_S = 1e6
+_CLASSES = {"free": FREE, "backward whirl": ROLLING, "forward whirl": SLIDING}
 _MAX_SLOWDOWN = 1e-3
 """Largest relative decrease of a steady whirl frequency in half a second."""
 _NAN = (math.nan, math.nan)
@@ -373,8 +375,8 @@ class Start:
 def start_by_pulse(force_n: float, *, points: int) -> Start:
     """Scan friction for one pulse of 5 ms at 6.2 Hz."""
     frictions = np.linspace(0.02, 0.40, points)
-    classes = np.array([whirl_class(ENGINE, float(mu), force_n) for mu in frictions])
-    return Start(force_n, frictions, classes)
+    runs = Batch(pulse_scene(Pulse(force_n=force_n)), ["contact.friction"]).run(frictions[:, None])
+    return Start(force_n, frictions, np.array([_CLASSES.get(outcome, BOUNCING) for outcome in runs["outcome"]]))
 
 
 def pulse_whirl(constants: Constants, *, force_n: float, duration_s: float) -> float:
