@@ -275,8 +275,9 @@ def evaluate(m):
     _ERROR, _FORCE_BEFORE, _FORCE_SLOPE, _OLD_X, _OLD_Y, _DEPTH, _SPEED, _MARGIN, _TRIAL, _CUT, _NEXT_INPUTS, _TRIES,
     _PER_TOLERANCE, _DEPTH_RATE, _SPEED_RATE,
     _CHANGED,
-) = range(37)  # fmt: skip
-_N_LANE = 37
+    _TOLERANCE,
+) = range(38)  # fmt: skip
+_N_LANE = 38
 _NO_EVENT, _ONSET, _LIFT_OFF, _STICK, _SLIP, _CORNER_EVENT = range(6)
 
 
@@ -511,7 +512,7 @@ def _set_phase(m, own, i, phase):
 @njit(cache=True, error_model="numpy", fastmath=False)
 def _load_run(m, own, i, run, batch, result):
     """Start a run in a lane."""
-    constants, initial, schedule, ends, watch_s = batch
+    constants, initial, schedule, ends, watch_s, tolerances = batch
     c, y = _C * LANES + i, _Y * LANES + i
     for n in range(N_CONSTANTS):
         m[c + n * LANES] = constants[run, n]
@@ -522,7 +523,7 @@ def _load_run(m, own, i, run, batch, result):
     phase, m[c + ONSET * LANES] = initial[run, N_STATE], max(initial[run, N_STATE + 1], m[c + SPEED_FLOOR * LANES])
     for n in range(_N_LANE):
         own[n, i] = 0.0
-    own[_RUN, i], own[_STEP, i], own[_CHANGED, i] = run, 1e-5, 1.0
+    own[_RUN, i], own[_STEP, i], own[_CHANGED, i], own[_TOLERANCE, i] = run, 1e-5, 1.0, tolerances[run]
     if phase != FLIGHT:
         own[_TRIES, i] = 1.0 if phase == ROLLING else 0.0
         own[_TAU_STEP, i] = 1e-5 / math.sqrt(_depth(m, i))
@@ -768,7 +769,7 @@ def _resolve_stick(m, own, i):
 @njit(cache=True, error_model="numpy", fastmath=False)
 def _reach_corner(m, own, i, batch, result):
     """Change a lane's inputs, begin the watch, or return True at the end of the run."""
-    _, _, schedule, ends, watch_s = batch
+    _, _, schedule, ends, watch_s, _ = batch
     run, y, c, mine = int(own[_RUN, i]), _Y * LANES + i, _C * LANES + i, result[i]
     now = own[_CORNER, i]
     m[y + TIME * LANES] = now
@@ -943,16 +944,15 @@ def _choose_step(m, own, i):
 
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
-def march(batch, per_scale, tolerance, early, results):
+def march(batch, per_scale, early, results):
     """Run a batch to the end, and write its results.
 
     Args:
         batch: Constants, shape (n, N_CONSTANTS); starts, shape (n, N_START); schedules, shape (n, k, 1 +
             N_INPUTS), each row an instant [s] and the inputs from then on, unused rows at infinity; ends [s], shape
-            (n,); lengths of the watch before the end [s], shape
-            (n,).
+            (n,); lengths of the watch before the end [s], and
+            scaled errors per step, shape (n,).
         per_scale: Reciprocal of the scale of each state, time and root in a step's error, shape (ROOT + 1,).
-        tolerance: Scaled error per step.
         early: Whether runs end when their outcome is certain.
         results: Out, shape (n, N_RESULTS).
     """
@@ -981,7 +981,7 @@ def march(batch, per_scale, tolerance, early, results):
                     _remember_start(m, own, i)
         for i in range(LANES):
             _choose_step(m, own, i)
-            own[_PER_TOLERANCE, i] = (_ROLLING_GAIN if own[_PHASE, i] == ROLLING else 1.0) / tolerance
+            own[_PER_TOLERANCE, i] = (_ROLLING_GAIN if own[_PHASE, i] == ROLLING else 1.0) / own[_TOLERANCE, i]
         _take_step(m)
         _estimate_errors(m, own, per_scale)
         changed = False

@@ -232,3 +232,18 @@ def test_a_run_that_cannot_start_has_failed_alone() -> None:
     assert table["trusted"].tolist() == [True, False]
     with pytest.raises(rig.InputError, match=r"ring\.offset must be within"):
         Batch(rig.load_scene("hammer", {"ring.offset_x": 5.0}), ["contact.friction"])
+
+
+def test_a_finer_tolerance_of_the_scene_makes_the_batch_finer() -> None:
+    batch, values = draw(12, 6)
+    fine = draw(12, 6, **{"engine.tolerance": 3e-8})[0].run(values)
+    assert fine["engine"].tolist() == ["lanes"] * 12
+    assert (fine["steps"] > 1.5 * batch.run(values)["steps"]).all()
+    assert np.max(np.abs(fine["energy_residual_j"])) < 1e-6
+
+
+@pytest.mark.parametrize("value", ["much", True, -0.1, float("nan")])
+def test_a_value_that_a_parameter_does_not_accept_is_refused(value: Any) -> None:
+    batch = Batch(rig.load_scene("hammer"), ["contact.friction"])
+    with pytest.raises(rig.InputError, match=r"contact\.friction must be a number from 0 to .*; received"):
+        batch.run([[0.2], [value]])
