@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rig.base.errors import InputError, UnknownNameError, require_package
+from rig.base.errors import InputError, UnknownNameError, Words, require_package
 from rig.base.files import whole_file
 from rig.base.samples import find_column
 from rig.base.text import build_html_table
@@ -131,6 +131,41 @@ class Ensemble:
 
         with whole_file(Path(path)) as draft:
             parquet.write_table(self.table, draft)
+
+    def plot_band(self, x: str, y: str, *, share: float = 0.95, groups: int = 20) -> Any:
+        """Plot the median of a column over another, with the band that has a share of the runs.
+
+        Args:
+            x: Column on the horizontal axis, of numbers.
+            y: Column on the vertical axis, of numbers; its NaN are left out.
+            share: Share of the runs within the band.
+            groups: Number of groups of equal size along x.
+
+        Returns:
+            The axes of a new matplotlib figure.
+
+        Raises:
+            UnknownNameError: A column does not exist.
+            InputError: A column has texts, or fewer numbers than groups.
+        """
+        at, values = self[x], self[y]
+        for name, column in ((x, at), (y, values)):
+            if column.dtype == object or np.count_nonzero(np.isfinite(column)) < groups:
+                raise InputError(name, f"a column with at least {groups} numbers", Words(column.dtype))
+        from matplotlib import pyplot
+
+        order = np.argsort(at, kind="stable")
+        parts = np.array_split(order[np.isfinite(values[order])], groups)
+        ends = 0.5 - 0.5 * share, 0.5, 0.5 + 0.5 * share
+        low, middle, high = np.array([np.quantile(values[part], ends) for part in parts]).T
+        places = [float(at[part].mean()) for part in parts]
+        axes = pyplot.subplots(layout="constrained")[1]
+        axes.fill_between(places, low, high, color="#0072B2", alpha=0.25, linewidth=0, label=f"{share:.0%} of the runs")
+        axes.plot(places, middle, color="#0072B2", label="median")
+        axes.set_xlabel(f"{x} [{self.unit(x) or 1}]")
+        axes.set_ylabel(f"{QUANTITIES[y].label.partition(',')[0] if y in QUANTITIES else y} [{self.unit(y) or 1}]")
+        axes.legend()
+        return axes
 
     def count_outcomes(self) -> dict[str, int]:
         """Return the number of runs by outcome, the most frequent first."""

@@ -10,6 +10,7 @@ import pytest
 
 import rig
 from rig.base.errors import InputError, UnknownNameError
+from rig.ensemble.ensemble import Ensemble
 
 OVER: dict[str, Any] = {
     "contact.friction": [0.1, 0.2],
@@ -67,3 +68,23 @@ def test_wrong_settings_are_refused() -> None:
     ):
         with pytest.raises(InputError, match=f"^{line}"):
             rig.ensemble("hammer", OVER, changes=CHANGES, **settings)
+
+
+def test_a_band_has_its_share_of_the_runs() -> None:
+    import pyarrow
+
+    rng = np.random.default_rng(1)
+    x = rng.uniform(0.0, 1.0, 20_000)
+    columns = {"contact.friction": x, "peak_force_n": 100.0 * x + rng.normal(size=len(x)), "outcome": ["free"] * len(x)}
+    arrays = {name: pyarrow.array(values) for name, values in columns.items()}
+    fields = [pyarrow.field(name, array.type, metadata={"unit": ""}) for name, array in arrays.items()]
+    runs = Ensemble(pyarrow.Table.from_arrays([*arrays.values()], schema=pyarrow.schema(fields)), {})
+    axes = runs.plot_band("contact.friction", "peak_force_n", share=0.9, groups=200)
+    median = axes.lines[0].get_xydata()
+    np.testing.assert_allclose(median[:, 1], 100.0 * median[:, 0], atol=0.7)
+    vertices = axes.collections[0].get_paths()[0].vertices
+    spreads = [np.ptp(vertices[np.isclose(vertices[:, 0], place, atol=1e-9), 1]) for place in median[:, 0]]
+    # Normal noise of width 1, spread further by the slope within a group.
+    assert np.median(spreads) == pytest.approx(2 * 1.645, abs=0.4)
+    with pytest.raises(InputError, match="outcome must be a column with at least 20 numbers"):
+        runs.plot_band("contact.friction", "outcome")
