@@ -223,7 +223,8 @@ class Batch:
     def _find_constant(self, key: str) -> tuple[int, bool, float] | None:
         """Return constant, whether it is the reciprocal, and factor to SI of a parameter that is one constant."""
         entry = self._parameters.entries[key]
-        if isinstance(entry.value, str) or entry.formula or entry.rules or entry.unit == "count":
+        # A ring's parameter also decides whether the shaft is in the ring at the start.
+        if isinstance(entry.value, str) or entry.formula or entry.rules or entry.unit == "count" or key[:5] == "ring.":
             return None
         low, high = entry.range
         value = (
@@ -232,10 +233,12 @@ class Batch:
             else 0.5 * (low + high)
         )
         try:
-            other = build_model(self._parameters.override({key: value}), self.scene.model)
+            other = _prepare(self.scene, build_model(self._parameters.override({key: value}), self.scene.model))
         except InputError:
             return None
-        before, after = _constants_row(self._model), _constants_row(other)
+        if other.schedule != self._own.schedule or (other.initial != self._own.initial).any():
+            return None
+        before, after = self._own.constants, other.constants
         changed, si = np.flatnonzero(before != after), value * SI[entry.unit]
         if len(changed) != 1 or after[changed[0]] not in (si, 1.0 / si):
             return None

@@ -47,7 +47,7 @@ BUDGETS = {
     "rig/base": 1064,
     "rig/channels": 2452,
     "rig/cli": 5586,
-    "rig/ensemble": 1942,
+    "rig/ensemble": 1944,
     "rig/physics": 5488,
     "rig/run": 1892,
     "rig/serve": 3019,

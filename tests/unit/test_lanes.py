@@ -247,3 +247,22 @@ def test_a_value_that_a_parameter_does_not_accept_is_refused(value: Any) -> None
     batch = Batch(rig.load_scene("hammer"), ["contact.friction"])
     with pytest.raises(rig.InputError, match=r"contact\.friction must be a number from 0 to .*; received"):
         batch.run([[0.2], [value]])
+
+
+@pytest.mark.parametrize("position", ["top", "given"])
+@pytest.mark.parametrize(("key", "value"), [("ring.clearance", 1.2), ("shaft.arm_ring", 0.21)])
+def test_a_parameter_that_moves_the_start_is_that_of_a_scene(key: str, value: float, position: str) -> None:
+    changes = {"contact.stiffness": 2.8e10, "duration_s": 0.01}  # a number, so that it depends on no other parameter
+    start = {"initial.position": position, "initial.x_mm": 0.5, "initial.y_mm": -0.7}
+    scene = rig.load_scene("hammer", {**changes, **start})
+    varied = Batch(scene, [key]).run([[value]], repeat=False)
+    scene = rig.load_scene(scene, {key: value})
+    same = Batch(scene, ["contact.friction"]).run([[0.25]], repeat=False)
+    assert varied["outcome"][0] != "failed"
+    for name in ("end", "peak_force_n", "peak_radius_mm", "contacts"):
+        assert np.array_equal(varied[name], same[name]), name
+
+
+def test_a_ring_that_does_not_hold_the_shaft_at_rest_fails() -> None:
+    scene = rig.load_scene("hammer", {"contact.stiffness": 2.8e10, "ring.offset_y": -1.2, "duration_s": 0.01})
+    assert Batch(scene, ["ring.clearance"]).run([[0.5], [0.2]])["outcome"].tolist() == ["free", "failed"]
