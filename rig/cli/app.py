@@ -80,6 +80,7 @@ COMMANDS = {
     "Simulate offline": {
         "simulate": "Simulate a scene at full speed and write it to a file",
         "sweep": "Simulate a scene many times with varied values",
+        "map": "Map the outcome of a scene over two of its values, with the borders found",
         "bench": "Measure speed and error of the engines on this machine",
         "ladder": "Find the cheapest model, engine and step within a tolerance",
         "chart": "Chart speed against error",
@@ -112,7 +113,8 @@ GROUPS = {
 
 NEED_FULL = (
     "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
-    "score", "plot", "campaign", "sessions", "simulate", "sweep", "bench", "ladder", "chart", "stability", "paper",
+    "score", "plot", "campaign", "sessions", "simulate", "sweep", "map", "bench", "ladder", "chart", "stability",
+    "paper",
 )  # fmt: skip
 """Commands that a lean install lacks; of `keys` it has the subcommands."""
 

@@ -87,6 +87,15 @@ def flatten(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def embed_parameters(scene: Scene) -> Scene:
+    """Return a scene whose parameters do not depend on a file, which a worker may not have."""
+    if scene.parameters in set_names():
+        return scene
+    own, usual = scene.load_parameters().entries, load_parameters().entries
+    changed = {key: entry.value for key, entry in own.items() if entry.value != usual[key].value}
+    return parse_scene({**scene.model_dump(), "parameters": DEFAULT_SET, "set": changed})
+
+
 def read_plan(path: Path) -> Work:
     """Return the work of a plan file.
 
@@ -97,10 +106,7 @@ def read_plan(path: Path) -> Work:
     file = plan.scene if plan.scene in scene_names() else path.parent / plan.scene
     scene = load_scene(file, plan.set)
     scene.check_physics()
-    if scene.parameters not in set_names():  # a file, which a worker may not have
-        own, usual = scene.load_parameters().entries, load_parameters().entries
-        changed = {key: entry.value for key, entry in own.items() if entry.value != usual[key].value}
-        scene = parse_scene({**scene.model_dump(), "parameters": DEFAULT_SET, "set": changed})
+    scene = embed_parameters(scene)
     over = flatten(plan.over)
     design = Design.create(scene, over, runs=plan.runs, sampling=plan.sampling, seed=plan.seed)
     document = {

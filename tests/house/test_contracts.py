@@ -82,7 +82,7 @@ BREACHES = [
     ("recorder.viewer.canvas", "recorder.viewer.painter", "No import cycles"),
     ("replays.recordings.whirl", "replays.studies.paper.document", "Layers of replays"),
     ("replays.report", "replays.recordings.whirl", "Layers of replays"),
-    ("replays.studies.laws", "replays.recordings.verdict", "Layers of replays"),
+    ("replays.studies.forces.laws", "replays.recordings.verdict", "Layers of replays"),
     ("replays.recordings.whirl", "replays.score.judgement", "Layers of replays"),
     ("replays.score.card.limits", "replays.campaigns.equipment.bench", "Layers of replays"),
     ("replays.campaigns.equipment.bench", "replays.campaigns.evidence", "No import cycles"),

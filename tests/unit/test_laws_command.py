@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from replays.studies.laws import compare, draw, restitution_curves
+from replays.studies.forces.laws import compare, draw, restitution_curves
 from rig.cli.main import main
 from rig.physics.contacts import DAMPING, KELVIN_VOIGT, STIFFNESS
 from rig.physics.parameters import load_parameters
@@ -110,7 +110,7 @@ def test_picture_labels_every_axis_and_law(monkeypatch: pytest.MonkeyPatch, tmp_
     from matplotlib.figure import Figure
 
     drawn: list[Figure] = []
-    monkeypatch.setattr("replays.studies.laws.save", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr("replays.studies.forces.laws.save", lambda figure, _: drawn.append(figure))
     draw(DEFAULT.override({"contact.restitution": 1.0}), tmp_path / "laws.png")
     panels = drawn[0].axes
     assert all("[" in axes.get_xlabel() and "[" in axes.get_ylabel() and axes.get_title("left") for axes in panels)

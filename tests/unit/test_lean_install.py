@@ -58,7 +58,7 @@ FULL_ARGUMENTS = {
     "score": "{rec} --against {rec}",
     "import": "{rec} --template x.toml", "validate": "{rec}", "identify": "{rec} --fit contact.friction",
 "view": "{rec}", "sessions": "-o {folder}", "campaign": "hammer", "run": "hammer",
-    "simulate": "hammer -o {folder}/x.mcap", "sweep": "x.toml -o {folder}/x",
+    "simulate": "hammer -o {folder}/x.mcap", "sweep": "x.toml -o {folder}/x", "map": "x.toml -o {folder}/x",
     "plot": "{rec} -o {folder}/plots",
     "can": "hub c0", "ladder": "hammer -q whirl_frequency -t 0.1", "paper": "-o {folder}/x.html",
 }  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from replays.studies.magnets import compare, draw
+from replays.studies.forces.magnets import compare, draw
 from rig.cli.main import main
 from rig.physics.model import build_model
 from rig.physics.parameters import load_parameters

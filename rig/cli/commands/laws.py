@@ -27,7 +27,7 @@ def laws(
     form: Form,
 ) -> None:
     """Compare all normal contact laws: requested and returned restitution, force, contact time, stiffness."""
-    from replays.studies.laws import compare, draw
+    from replays.studies.forces.laws import compare, draw
 
     also = {} if restitution is None else {"contact.restitution": restitution}
     parameters = override_parameters(name, changes, also, law)

@@ -20,7 +20,7 @@ def magnets(
     form: Form,
 ) -> None:
     """Compare the magnet models: spring, far-field sum, exact cylinders, and the maps used in a run."""
-    from replays.studies.magnets import compare, draw
+    from replays.studies.forces.magnets import compare, draw
     from rig.physics.model import build_model
 
     model = build_model(override_parameters(name, changes))

@@ -1,0 +1,1 @@
+"""Studies of the force laws of contact and magnets."""
