@@ -11,7 +11,7 @@ import pytest
 import rig
 from drivers.can.dbc import database
 from drivers.can.signals import default_messages, messages_for
-from replays.studies.bench import CASES
+from replays.studies.bench.engines import CASES
 from rig.base.errors import InputError
 from rig.base.wire import row_tick
 from rig.channels.channel_file import read_channels

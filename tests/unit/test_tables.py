@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import rig.cli
-from replays.studies.bench import CASES
+from replays.studies.bench.engines import CASES
 from replays.studies.stability.trials.cell import Cell
 from rig.cli.commands.bench import cases_table
 from rig.cli.commands.info import describe, events_table
