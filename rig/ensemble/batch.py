@@ -207,8 +207,14 @@ class Batch:
         self._own = _prepare(scene, self._model)
         self._direct: dict[int, tuple[int, bool, float]] = {}
         self._indirect: list[int] = []
+        # Other levels, starts and rules let a parameter be another constant, or none.
+        entries = self._parameters.entries
+        mixed = any(
+            entries[key].rules or entries[key].formula if key in entries else key.split(".")[0] in _MIXING
+            for key in self.keys
+        )
         for position, key in enumerate(self.keys):
-            if key in self._parameters.entries and (direct := self._find_constant(key)) is not None:
+            if key in entries and not mixed and (direct := self._find_constant(key)) is not None:
                 self._direct[position] = direct
             else:
                 self._indirect.append(position)
@@ -244,22 +250,28 @@ class Batch:
             return None
         return int(changed[0]), bool(after[changed[0]] != si), SI[entry.unit]
 
-    def _model_of(self, changes: tuple[tuple[str, Any], ...], levels: Any) -> Model:
-        return build_model(self._parameters.override(dict(changes)) if changes else self._parameters, levels)
+    def _model_of(self, changes: tuple[tuple[str, Any], ...], levels: Any, name: str) -> Model:
+        base = self._parameters
+        if name != self.scene.parameters:
+            base = self.scene.model_copy(update={"parameters": name}).load_parameters()
+        return build_model(base.override(dict(changes)) if changes else base, levels)
 
     def _change_scene(self, changes: dict[str, Any]) -> Scene:
         """Return the scene with changed fields; plain numbers without the slow validation of the whole scene."""
         others, scene = {}, self.scene
         for key, value in changes.items():
             bounds = self._bounds[key]
-            if not isinstance(value, float) or not bounds.low < value < bounds.high or key not in _PLAIN_FIELDS:
+            name = key.partition(".")[0]
+            alone = sum(each.request.command == name for each in scene.commands) < 2  # else pulses may overlap
+            if not isinstance(value, float) or not (
+                alone and key in _PLAIN_FIELDS and bounds.low < value < bounds.high
+            ):
                 others[key] = value
             elif key == "drive.speed_hz":
                 scene = scene.model_copy(
                     update={"drive": scene.drive.model_copy(update={"speed_hz": value, "profile": ()})}
                 )
             else:
-                name = key.partition(".")[0]
                 place = next(i for i, each in enumerate(scene.commands) if each.request.command == name)
                 old = scene.commands[place]
                 new = old.model_copy(update={"request": old.request.model_copy(update={_PLAIN_FIELDS[key]: value})})
@@ -272,12 +284,14 @@ class Batch:
         """Prepare a run from the values of the keys that are not single constants; None if it cannot start."""
         changes = dict(zip([self.keys[position] for position in self._indirect], values, strict=True))
         parameters = {key: value for key, value in changes.items() if key in self._parameters.entries}
-        scene = self._change_scene({key: value for key, value in changes.items() if key not in parameters})
-        if parameters:
-            scene = scene.model_copy(update={"set": {**scene.set, **parameters}})
         try:
-            return _prepare(scene, self._build_model(tuple(parameters.items()), scene.model))
+            scene = self._change_scene({key: value for key, value in changes.items() if key not in parameters})
+            if parameters:
+                scene = scene.model_copy(update={"set": {**scene.set, **parameters}})
+            return _prepare(scene, self._build_model(tuple(parameters.items()), scene.model, scene.parameters))
         except InputError:
+            for key, value in changes.items():
+                vary(self.scene, {key: value})  # refuses a value that is wrong alone
             return None
 
     def run(
@@ -379,6 +393,8 @@ _PLAIN_FIELDS = {
     "hammer.angle_deg": "direction", "speed.speed_hz": "speed_hz",
 }  # fmt: skip
 """Keys whose numbers depend on no other field of the scene, with the field of the command."""
+_MIXING = ("model", "initial", "parameters")
+"""First parts of keys that select equations, start or set."""
 _COLUMNS = [
     COLUMN[name]
     for name in ("penetration", "ring_x", "ring_y", "disk_x", "disk_y", "P_E", "P_W", "P_N", "P_S", "sliding_speed")

@@ -72,13 +72,11 @@ def vary(scene: Scene, changes: dict[str, Any]) -> Scene:
         if place is None:
             must = such_as("a field of a command that the scene has", key, [each.request.command for each in commands])
             raise InputError(key, must, value)
-        timed = commands[place].model_dump()
-        if field == "at_s":
-            timed["at_s"] = value
-        else:
-            request = {**timed["request"], _OTHER_NAMES.get(field, field): value}
-            timed["request"] = check_command(name, request).model_dump()
-        commands[place] = TimedCommand.model_construct(**timed)
+        update = {"at_s": value}
+        if field != "at_s":
+            request = {**commands[place].request.model_dump(), _OTHER_NAMES.get(field, field): value}
+            update = {"request": check_command(name, request)}
+        commands[place] = commands[place].model_copy(update=update)
     if len(rest) < len(changes):
         dumped = [{"at_s": each.at_s, "request": dict(each.request)} for each in commands]
         scene = parse_scene({**scene.model_dump(), "commands": dumped})

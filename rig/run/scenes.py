@@ -337,7 +337,11 @@ def _build_scene(data: dict[str, Any], overrides: list[str]) -> Scene:
     scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
     if data.get("fidelity") == "auto":
         scene = _apply_pick(scene, data, overrides)
-    # Parameters are checked here, so that a scene that loads can run.
+    return _check_speeds(scene)
+
+
+def _check_speeds(scene: Scene) -> Scene:
+    """Return a scene after checking its parameters and its speeds, so that a scene that loads can run."""
     top = scene.load_parameters().entries["drive.top_speed"].value
     speeds = {"drive.speed_hz": [scene.drive.speed_hz], "drive.profile": [speed for _, speed in scene.drive.profile]}
     speeds["speed.speed_hz"] = [
@@ -366,7 +370,7 @@ def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
         data["engine"]["tolerance"] = 0.0
     for key, value in pairs:
         _override(data, key, value)
-    return parse_scene(data)
+    return _check_speeds(parse_scene(data))
 
 
 def _list_changes(changes: dict[str, Any]) -> list[tuple[str, Any]]:

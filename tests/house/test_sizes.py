@@ -47,9 +47,9 @@ BUDGETS = {
     "rig/base": 1064,
     "rig/channels": 2452,
     "rig/cli": 5768,
-    "rig/ensemble": 1947,
+    "rig/ensemble": 1959,
     "rig/physics": 5488,
-    "rig/run": 1892,
+    "rig/run": 1893,
     "rig/serve": 3019,
 }
 _NO_CODE = (

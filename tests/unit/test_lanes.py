@@ -10,6 +10,7 @@ import pytest
 
 import rig
 import rig.run.scenes
+from rig.base.errors import InputError
 from rig.ensemble import batch as batches
 from rig.ensemble import lanes as L
 from rig.ensemble.batch import QUANTITIES, Batch
@@ -266,3 +267,32 @@ def test_a_parameter_that_moves_the_start_is_that_of_a_scene(key: str, value: fl
 def test_a_ring_that_does_not_hold_the_shaft_at_rest_fails() -> None:
     scene = rig.load_scene("hammer", {"contact.stiffness": 2.8e10, "ring.offset_y": -1.2, "duration_s": 0.01})
     assert Batch(scene, ["ring.clearance"]).run([[0.5], [0.2]])["outcome"].tolist() == ["free", "failed"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"parameters": "dtu-2019"},
+        {"model.friction": "none", "contact.friction": 0.2},
+        {"contact.stiffness": "internal-sphere", "shaft.radius": 20.0},
+        {"initial.position": "top", "shaft.arm_ring": 0.21},
+    ],
+    ids=str,
+)
+def test_keys_that_change_the_meaning_of_others_are_those_of_a_scene(changes: dict[str, Any]) -> None:
+    scene = rig.load_scene("hammer", {"contact.stiffness": 2.8e10, "duration_s": 0.03})
+    varied = Batch(scene, [*changes]).run([[*changes.values()]], repeat=False)
+    same = Batch(rig.load_scene(scene, changes), ["seed"]).run([[1]], repeat=False)
+    assert np.array_equal(varied["end"], same["end"])
+
+
+def test_a_refused_combination_fails_alone_and_a_wrong_value_is_refused() -> None:
+    scene = rig.load_scene("hammer", {"duration_s": 0.03})
+    impacts = tuple(scene.commands[0].model_copy(update={"at_s": at_s}) for at_s in (0.01, 0.028))
+    scene = scene.model_copy(update={"commands": impacts})
+    batch = Batch(scene, ["hammer.at_s", "hammer.duration_ms"])
+    assert batch.run([[0.01, 5.0], [0.02, 9.0]])["outcome"].tolist() == ["impacts", "failed"]
+    with pytest.raises(InputError, match=r"^hammer\.duration_ms must be"):
+        batch.run([[0.01, -5.0]])
+    with pytest.raises(InputError, match=r"^drive\.speed_hz must be at most drive\.top_speed = 15 Hz; received 15\.5"):
+        Batch(scene, ["drive.speed_hz"]).run([[15.5]])
