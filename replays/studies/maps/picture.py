@@ -167,6 +167,6 @@ def _draw_conditions(ax: Any, found: Map, speed_hz: float | None) -> None:
     for place, style in ((least, "--"), (moving, ":")):
         if plan.x.start < place < plan.x.stop:
             ax.axvline(place, color=RED, ls=style, lw=1.6)
-    friction = np.linspace(plan.x.start, plan.x.stop, 200)
+    friction = np.linspace(max(plan.x.start, 1e-3), plan.x.stop, 200)
     force = [critical_whirl(own, float(each)) / newton for each in friction]
     ax.plot(friction, force, color=ORANGE, lw=2.0, label="the pulse alone starts a whirl that gains speed (eq. 43)")

@@ -88,7 +88,7 @@ class MapPlan(Written):
     """Coarse cells along an axis."""
     border: Annotated[FiniteFloat, Field(ge=0.0005, le=0.5)] = 0.005
     """Largest width of a border cell, as a share of the axis."""
-    margins: Annotated[int, Field(ge=0, le=12)] = 2
+    margins: Annotated[int, Field(ge=0, le=12)] = 1
     """Levels at which neighbours of border cells are divided too."""
     check_runs: Annotated[int, Field(ge=0, le=100_000)] = 500
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
