@@ -42,7 +42,7 @@ BUDGETS = {
     "replays/report": 507,
     "replays/score": 4248,
     "replays/sessions": 77,
-    "replays/studies": 9917,
+    "replays/studies": 9919,
     "rig": 64,
     "rig/base": 1064,
     "rig/channels": 2452,

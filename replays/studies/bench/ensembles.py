@@ -181,6 +181,8 @@ def measure_ensembles(
     missing = sorted({each.module for each in known if each.module and not find_spec(each.module)})
     sets = {each.runs: Runs(values[: each.runs]) for each in known}
     shared = Runs(values[:PEER_RUNS])
+    if peers and find_spec("heyoka"):
+        import_module("heyoka").set_logger_level_error()  # its warnings would be lines of our output
     progress("references")
     references = shared.march(_REFERENCE_TOLERANCE), _simulate("taylor")(shared, _TAYLOR_TOLERANCE).states
     chosen: list[tuple[Method, float]] = []
