@@ -103,6 +103,8 @@ _WHIRL_TURNS = 3.0
 _WHIRL_MARGIN = 0.85
 _MAX_LOCATIONS = 40
 _WORTHWHILE_GROWTH = 1.3
+_NEW_PEAK, _MAX_HALVINGS = 1.001, 3
+"""Ratio to all before from which a peak is worth a shorter step, and the number of times that its step is halved."""
 _ROLLING_GAIN = 0.01
 """Error per step of a rolling contact as a share: it is not amplified by impacts."""
 
@@ -276,8 +278,10 @@ def evaluate(m):
     _PER_TOLERANCE, _DEPTH_RATE, _SPEED_RATE,
     _CHANGED,
     _TOLERANCE,
-) = range(38)  # fmt: skip
-_N_LANE = 38
+    _HALVINGS,
+    _PEAKS,
+) = range(40)  # fmt: skip
+_N_LANE = _PEAKS + 4
 _NO_EVENT, _ONSET, _LIFT_OFF, _STICK, _SLIP, _CORNER_EVENT = range(6)
 
 
@@ -657,38 +661,49 @@ def _is_located(m, own, i, event, value):
 
 
 @njit(cache=True, error_model="numpy", fastmath=False)
+def _find_peaks(m, own, i, result):
+    """Find the peaks of force, squared radius and displacements of the transducers within a lane's step.
+
+    Returns:
+        True if one exceeds both ends of the step and all before it: a shorter step finds it more accurately.
+    """
+    y, z, k, d = _Y * LANES + i, _Z * LANES + i, _K * LANES + i, _D * LANES + i
+    c, seen, h, coarse = _C * LANES + i, _EVALUATION * LANES + i, m[_H * LANES + i], False
+    ratio = m[c + ARM_DISK * LANES] / m[c + ARM_RING * LANES]
+    offset_x, offset_y, disk = ratio * m[c + OFFSET_X * LANES], ratio * m[c + OFFSET_Y * LANES], m[c + ARM_DISK * LANES]
+    for n in range(4):
+        if n == 0:
+            start, end = own[_FORCE_BEFORE, i], m[seen + FORCE * LANES]
+            slope, last = own[_FORCE_SLOPE, i], m[seen + FORCE_RATE * LANES]
+        elif n == 1:
+            x0, y0 = disk * m[y + UX * LANES] - offset_x, disk * m[y + UY * LANES] - offset_y
+            x1, y1 = disk * m[z + UX * LANES] - offset_x, disk * m[z + UY * LANES] - offset_y
+            start, end = x0 * x0 + y0 * y0, x1 * x1 + y1 * y1
+            slope = 2.0 * disk * (x0 * m[k + UX * LANES] + y0 * m[k + UY * LANES])
+            last = 2.0 * disk * (x1 * m[d + UX * LANES] + y1 * m[d + UY * LANES])
+        elif n == 2:
+            start, end = m[y + X_OH * LANES], m[z + X_OH * LANES]
+            slope, last = m[k + X_OH * LANES], m[d + X_OH * LANES]
+        else:
+            start, end = m[y + Y_IH * LANES] - m[y + Y_OH * LANES], m[z + Y_IH * LANES] - m[z + Y_OH * LANES]
+            slope, last = m[k + Y_IH * LANES] - m[k + Y_OH * LANES], m[d + Y_IH * LANES] - m[d + Y_OH * LANES]
+        peak = _peak(start, slope, end, last, h)
+        own[_PEAKS + n, i] = peak
+        coarse = coarse or peak > _NEW_PEAK * max(abs(start), abs(end), result[i, PEAK_FORCE + n])
+    return coarse
+
+
+@njit(cache=True, error_model="numpy", fastmath=False)
 def _accept(m, own, i, result):
     """Take over the end of a lane's step as its state, and collect the results within the step."""
-    y, z, k, d, seen, h = (
-        _Y * LANES + i,
-        _Z * LANES + i,
-        _K * LANES + i,
-        _D * LANES + i,
-        _EVALUATION * LANES + i,
-        m[_H * LANES + i],
-    )
-    c, mine = _C * LANES + i, result[i]
-    dt = m[z + TIME * LANES] - m[y + TIME * LANES]
+    y, z, k, d = _Y * LANES + i, _Z * LANES + i, _K * LANES + i, _D * LANES + i
+    seen, mine = _EVALUATION * LANES + i, result[i]
     own[_STEPS, i] += 1.0
-    before, arm, disk = m[y : y + N_VECTOR * LANES : LANES], m[c + ARM_RING * LANES], m[c + ARM_DISK * LANES]
+    own[_HALVINGS, i] = 0.0
     if own[_PHASE, i] != FLIGHT:
-        mine[CONTACT_TIME] += dt
-        slope, after, end_slope = own[_FORCE_SLOPE, i], m[seen + FORCE * LANES], m[seen + FORCE_RATE * LANES]
-        if max(own[_FORCE_BEFORE, i], after) > mine[PEAK_FORCE] or (slope > 0.0 and end_slope < 0.0):
-            mine[PEAK_FORCE] = max(mine[PEAK_FORCE], _peak(own[_FORCE_BEFORE, i], slope, after, end_slope, h))
-    ratio = disk / arm
-    x0, y0 = disk * before[UX] - ratio * m[c + OFFSET_X * LANES], disk * before[UY] - ratio * m[c + OFFSET_Y * LANES]
-    x1 = disk * m[z + UX * LANES] - ratio * m[c + OFFSET_X * LANES]
-    y1 = disk * m[z + UY * LANES] - ratio * m[c + OFFSET_Y * LANES]
-    slope = 2.0 * disk * (x0 * m[k + UX * LANES] + y0 * m[k + UY * LANES])
-    end_slope = 2.0 * disk * (x1 * m[d + UX * LANES] + y1 * m[d + UY * LANES])
-    mine[PEAK_RADIUS] = max(mine[PEAK_RADIUS], _peak(x0 * x0 + y0 * y0, slope, x1 * x1 + y1 * y1, end_slope, h))
-    mine[PEAK_X] = max(
-        mine[PEAK_X], _peak(before[X_OH], m[k + X_OH * LANES], m[z + X_OH * LANES], m[d + X_OH * LANES], h)
-    )
-    gap, end_gap = before[Y_IH] - before[Y_OH], m[z + Y_IH * LANES] - m[z + Y_OH * LANES]
-    slope, end_slope = m[k + Y_IH * LANES] - m[k + Y_OH * LANES], m[d + Y_IH * LANES] - m[d + Y_OH * LANES]
-    mine[PEAK_Y] = max(mine[PEAK_Y], _peak(gap, slope, end_gap, end_slope, h))
+        mine[CONTACT_TIME] += m[z + TIME * LANES] - m[y + TIME * LANES]
+    for n in range(4):
+        mine[PEAK_FORCE + n] = max(mine[PEAK_FORCE + n], own[_PEAKS + n, i])
     nx, ny = m[seen + NORMAL_X * LANES], m[seen + NORMAL_Y * LANES]
     cosine = own[_OLD_X, i] * nx + own[_OLD_Y, i] * ny
     sine = own[_OLD_X, i] * ny - own[_OLD_Y, i] * nx
@@ -903,6 +918,9 @@ def _decide(m, own, i, batch, early, result):
         if other != _NO_EVENT and other != event:
             _begin_location(m, own, i, h, other)
             return UNFINISHED, False
+    if _find_peaks(m, own, i, result) and event == _NO_EVENT and own[_HALVINGS, i] < _MAX_HALVINGS:
+        own[controlled, i], own[_HALVINGS, i] = 0.5 * h, own[_HALVINGS, i] + 1.0
+        return UNFINISHED, False
     own[_EVENT, i] = _NO_EVENT
     _accept(m, own, i, result)
     changed = False
