@@ -31,7 +31,7 @@ _LOOKS = {
 """Colour and hatch by class; the colours also differ in grey."""
 _STEPS = (("#F2F2F2", ""), (SKY, "//"), (BLUE, ""), (ORANGE, ".."), (RED, "xx"))
 """The same by number, for classes of a quantity."""
-_CONTOURS = 8
+_CONTOURS = 5
 
 
 @house_style()
@@ -128,10 +128,9 @@ def _draw_quantity(ax: Any, found: Map, panel: int) -> None:
     x, y = plan.x.place(steps), plan.y.place(steps)
     quantity = QUANTITIES[plan.quantity]
     colours = ax.pcolormesh(x, y, values, cmap="cividis", shading="gouraud", rasterized=True)
-    ax.figure.colorbar(colours, ax=ax, label=axis_label(quantity.label.partition(",")[0], quantity.unit))
+    bar = ax.figure.colorbar(colours, ax=ax, label=axis_label(quantity.label.partition(",")[0], quantity.unit))
     if np.nanmax(values) > np.nanmin(values):
-        lines = ax.contour(x, y, values, levels=_CONTOURS, colors="white", linewidths=0.9)
-        ax.clabel(lines, fontsize=8.5, fmt="%g")
+        bar.add_lines(ax.contour(x, y, values, levels=_CONTOURS, colors="white", linewidths=0.9))
 
 
 def _draw_band(ax: Any, found: Map, places: np.ndarray, quantiles: np.ndarray) -> None:
