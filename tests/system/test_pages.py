@@ -233,7 +233,7 @@ def test_every_command_in_the_docs_exists_with_its_options(page: Path) -> None:
         options = {name for parameter in command.params for name in [*parameter.opts, *parameter.secondary_opts]}
         options |= {"--help", "-h"}
         for word in rest:
-            if word.startswith("-") and not re.match(r"-\d", word):
+            if word.startswith("-") and not re.match(r"-(\d|-$)", word):  # numbers follow `--`
                 assert word.rstrip(",.;)").partition("=")[0] in options, f"{word} in: rig {' '.join(words)}"
                 found += 1
     assert found or page.stem in ("python", "CHANGELOG")
