@@ -19,8 +19,8 @@ _PLACES = 9
 def find_band(work: MapWork, workers: Workers, step: Callable[[int], None]) -> tuple[np.ndarray, np.ndarray]:
     """Return places along x, and the 2.5, 50 and 97.5 % quantiles of the quantity there, shapes (9,) and (3, 9).
 
-    The assumed values are those of the report of the paper, with their ranges, in a Latin hypercube, the same at each
-    place. The key of y has its value in the scene.
+    The assumed values are parameters in the report of the paper that are independent of others, with their ranges, in
+    a Latin hypercube, the same at each place. The key of y has its value in the scene.
 
     Args:
         work: A plan with a quantity.

@@ -136,7 +136,7 @@ def _draw_quantity(ax: Any, found: Map, panel: int) -> None:
 def _draw_band(ax: Any, found: Map, places: np.ndarray, quantiles: np.ndarray) -> None:
     plan, quantity = found.work.plan, QUANTITIES[found.work.plan.quantity]
     low, middle, high = quantiles
-    ax.fill_between(places, low, high, color=SKY, alpha=0.4, lw=0, label="95 % of all assumed values")
+    ax.fill_between(places, low, high, color=SKY, alpha=0.4, lw=0, label="95 % over the assumed values")
     ax.plot(places, middle, color=BLUE, lw=1.8, label="median")
     label = axis_label(quantity.label.partition(",")[0], quantity.unit)
     ax.set(xscale=plan.x.scale, xlabel=_label(plan.x, found), ylabel=label)

@@ -93,7 +93,7 @@ class MapPlan(Written):
     check_runs: Annotated[int, Field(ge=0, le=100_000)] = 500
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     band_runs: Annotated[int, Field(ge=0, le=10_000)] = 0
-    """Runs of the 95 % band from all assumed values at each of nine points along x."""
+    """Runs of the 95 % band over the assumed values at each of nine points along x."""
     overlay: Literal["", "dry whirl"] = ""
     """Closed-form conditions that are drawn over the map: x must be the friction, y the force of the hammer."""
     marks: tuple[Mark, ...] = ()
