@@ -157,7 +157,7 @@ def _is_supported(scene: Scene, model: Model) -> bool:
 
 
 class _Prepared(NamedTuple):
-    """What the kernel needs of a run."""
+    """Data of a run for the kernel."""
 
     scene: Scene
     constants: np.ndarray

@@ -432,7 +432,7 @@ def _estimate_errors(m, own, per_scale):
 def _evaluate_start(m, own):
     """Evaluate the rates at the start of the next step of the lanes that have changed.
 
-    Those of the other lanes stay, as they may differ in the last bits: a run must not depend on its neighbours.
+    The rates of the other lanes stay, as they may differ in the last bits: a run must not depend on its neighbours.
     """
     for n in range(_SIZE):
         m[_Z * LANES + n] = m[_Y * LANES + n]
@@ -884,7 +884,7 @@ def _decide(m, own, i, batch, early, result):
     """Accept or repeat a lane's step, and apply the event at its end.
 
     Returns:
-        Status of the run, and whether its rates must be evaluated anew.
+        Status of the run, and whether its rates must be evaluated again.
     """
     h, error, event = m[_H * LANES + i], own[_ERROR, i], int(own[_EVENT, i])
     slowed = m[_C * LANES + SLOWED * LANES + i] != 0.0

@@ -37,7 +37,7 @@ class GroupMethod(NamedTuple):
     rates: Callable[[Kind], Callable[..., Any]]
     """Return the function of time, state and parameters that gives the rates."""
     make_contact: Callable[[Kind], Any]
-    """As in `taylor.PhaseMethod`."""
+    """Values as in `taylor.PhaseMethod`."""
 
 
 class _Call(diffrax._Phase):
