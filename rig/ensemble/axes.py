@@ -18,6 +18,7 @@ from pydantic import Field, field_validator, model_validator
 from rig.base.checks import Written, check
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.ensemble.keys import Bounds, find_bounds, vary
+from rig.physics.model import build_model
 from rig.run.scenes import Scene
 
 Sampling = Literal["grid", "random", "latin", "sobol", "halton"]
@@ -30,6 +31,8 @@ _NUMBERS = {
     "triangular": ("from", "mode", "to"),
 }
 """Required numbers of each distribution."""
+_MAX_VALUES = 1_000_000
+"""Most values of a list or grid."""
 _CHECKED = 64
 """Longest list of which each value is checked; of a longer one, the ends."""
 _SEEDS, _NUMBERS_OF_RUNS, _PERMUTATIONS = 1, 2, 3
@@ -53,7 +56,7 @@ class Axis(Written):
     """First value of a grid, or lower limit of a distribution."""
     stop: Number | None = Field(None, alias="to")
     """Last value of a grid, or upper limit of a distribution."""
-    count: Annotated[int, Field(ge=2, le=1_000_000)] | None = None
+    count: Annotated[int, Field(ge=2, le=_MAX_VALUES, strict=True)] | None = None
     """Number of values of a grid."""
     scale: Literal["linear", "log"] = "linear"
     """Spacing of a grid, or of the variable of a uniform distribution."""
@@ -84,18 +87,19 @@ class Axis(Written):
     @field_validator("values", mode="before")
     @classmethod
     def _check_values(cls, values: Any) -> tuple[Any, ...]:
-        values = tuple(values) if isinstance(values, list | tuple | range) else ()
-        plain = (bool, int, float, str)
-        if not values or not all(isinstance(each, plain) and each == each and each not in (math.inf, -math.inf)
-                                 for each in values):  # fmt: skip
-            raise ValueError("a list of numbers or texts, not empty")
-        return values
+        values = values if isinstance(values, list | tuple | range) and len(values) <= _MAX_VALUES else ()
+        if not values or not all(isinstance(each, str) or (isinstance(each, bool | int | float)
+                                 and -1e300 < each < 1e300) for each in values):  # fmt: skip
+            raise ValueError(f"a list of 1 to {_MAX_VALUES} numbers or texts")
+        return tuple(values)
 
     @field_validator("distribution")
     @classmethod
     def _check_distribution(cls, distribution: Any) -> Any:
         if distribution is not None and distribution not in [*_NUMBERS] and not hasattr(distribution, "ppf"):
             raise UnknownNameError("distribution", f"one of {', '.join(_NUMBERS)}", distribution, _NUMBERS)
+        if hasattr(distribution, "ppf") and not (np.ndim(half := distribution.ppf(0.5)) == 0 and math.isfinite(half)):
+            raise ValueError("a distribution of one finite number")
         return distribution
 
     @model_validator(mode="after")
@@ -242,6 +246,8 @@ class Design:
         if not isinstance(over, Mapping) or not over:
             raise InputError("over", "a table of axes by key, not empty", over)
         axes = {str(key): Axis.read(given, f"over.{key}") for key, given in over.items()}
+        if {"hammer.direction", "hammer.angle_deg"} <= axes.keys():
+            raise InputError("over.hammer.direction", "left out with hammer.angle_deg", Words("both"))
         sizes = [0 if axis.points is None else len(axis.points) for axis in axes.values()]
         if sampling is None:
             sampling = "grid" if all(sizes) and runs is None else "random"
@@ -265,7 +271,8 @@ class Design:
         for key, axis in axes.items() if checks else ():
             for value in axis.list_checked(bounds[key], f"over.{key}"):
                 try:
-                    vary(scene, {key: value})
+                    varied = vary(scene, {key: value})
+                    build_model(varied.load_parameters(), varied.model)
                 except InputError as error:
                     own = error.field.removeprefix("set.") == key
                     must = error.must if own else f"a value that the scene accepts ({error})"

@@ -204,7 +204,7 @@ def check_quantities(names: Iterable[str] | None) -> tuple[str, ...]:
         raise InputError("quantities", "a list of names", names)
     chosen = [*QUANTITIES] if names is None else list(names)
     for name in chosen:
-        if name not in QUANTITIES:
+        if not isinstance(name, str) or name not in QUANTITIES:
             raise UnknownNameError("quantities", "names of quantities", name, QUANTITIES)
     return tuple(dict.fromkeys((*ALWAYS, *chosen)))
 

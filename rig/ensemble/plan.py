@@ -9,9 +9,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, StrictBool
 
 from rig.base.checks import Written, check, read_json, read_toml
+from rig.base.errors import InputError, Words
 from rig.ensemble.axes import MAX_RUNS, Design, Sampling
 from rig.ensemble.ensemble import check_quantities
 from rig.physics.parameters import DEFAULT_SET, load_parameters, set_names
@@ -19,6 +20,8 @@ from rig.run.scenes import Scene, load_scene, parse_scene, scene_document, scene
 
 _PACKAGES = ("rotor-stator-rig", "numpy", "scipy", "numba", "pyarrow")
 """Packages that determine the bytes of a part."""
+_MAX_TASKS = 1_000_000
+"""Most tasks: each is a file in one folder."""
 
 _AXIS_FIELDS = {"values", "from", "to", "scale", "distribution", "mean", "std"}
 """Fields of an axis that are no part of a key, as count is of magnet.count."""
@@ -37,7 +40,7 @@ class Plan(Written):
     quantities: tuple[str, ...] | None = None
     task_runs: Annotated[int, Field(ge=1, le=1_000_000, strict=True)] = 2000
     """Runs of a task, which is one part of the output."""
-    early_end: bool = True
+    early_end: StrictBool = True
     """End a run as soon as its outcome is known."""
     set: dict[str, Any] = Field(default={})
     """Changed values of the scene by key."""
@@ -83,7 +86,10 @@ def flatten(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in table.items():
         is_axis = not isinstance(value, dict) or not value or _AXIS_FIELDS & value.keys()
-        flat |= {prefix + name: value} if is_axis else flatten(value, f"{prefix}{name}.")
+        found = {prefix + name: value} if is_axis else flatten(value, f"{prefix}{name}.")
+        for key in found.keys() & flat.keys():
+            raise InputError(f"over.{key}", "given once", Words("two tables"))
+        flat |= found
     return flat
 
 
@@ -109,6 +115,9 @@ def read_plan(path: Path) -> Work:
     scene = embed_parameters(scene)
     over = flatten(plan.over)
     design = Design.create(scene, over, runs=plan.runs, sampling=plan.sampling, seed=plan.seed)
+    if design.runs > _MAX_TASKS * plan.task_runs:
+        least = -(-design.runs // _MAX_TASKS)
+        raise InputError("task_runs", f"at least {least}, as a sweep has at most {_MAX_TASKS} tasks", plan.task_runs)
     document = {
         "title": plan.title,
         "scene": scene_document(scene),

@@ -206,6 +206,12 @@ REFUSED_PLANS = {
     'scene = "hammer"\n[set]\n"contact.frction" = 1\n[over."contact.friction"]\nvalues = [0.1]': "contact.frction must",
     'scene = "hammer"\n[over."contact.friction"]\nvalues = []': "over.contact.friction.values must be a list of",
     'scene = "hammer"\n[over.contact.friction]\nvalues = [9]': "over.contact.friction must be a number",
+    """scene = "hammer"
+    over.contact.friction = [0.1]
+    over."contact.friction" = [0.2]
+    """: "over.contact.friction must be given once; received two tables",
+    'scene = "hammer"\nruns = 1000000000\ntask_runs = 1\n[over]\nhammer.force_n = [1]': "task_runs must be at least",
+    'scene = "hammer"\nearly_end = "no"\n[over]\nhammer.force_n = [1]': "early_end must be ",
     'scene = "hammer"\n[over.contact]\nfriction = [9]': "over.contact.friction must be a number from 0 to 2",
     'scene = "hammer"\n[over.magnet]\ncount = [2]': "over.magnet.count must be a whole number from 3 to 64; received 2",
     'scene = "test-quiet"\n[over."contact.friction"]\nvalues = [0.1]': "scene must be one of the physics",

@@ -134,9 +134,14 @@ def test_distributions_are_truncated_at_their_own_limits_and_those_of_the_key() 
 
 REFUSED_AXES = [
     ({"contact.frction": [1.0]}, "over.contact.frction must be a field of a scene or a parameter, such as contact.fr"),
-    ({"contact.friction": []}, "over.contact.friction.values must be a list of numbers or texts, not empty"),
-    ({"contact.friction": [[1.0]]}, "over.contact.friction.values must be a list of numbers or texts"),
-    ({"contact.friction": [float("nan")]}, "over.contact.friction.values must be a list of numbers or texts"),
+    ({"contact.friction": []}, "over.contact.friction.values must be a list of 1 to 1000000 numbers"),
+    ({"contact.friction": range(10**9)}, "over.contact.friction.values must be a list of 1 to 1000000 numbers"),
+    ({"contact.friction": [10**400]}, "over.contact.friction.values must be a list of 1 to 1000000 numbers"),
+    ({"contact.friction": {"from": 0.1, "to": 0.2, "count": "3"}}, "over.contact.friction.count must be a valid int"),
+    ({"contact.stiffness": ["1/0"]}, "over.contact.stiffness must be "),
+    ({"hammer.direction": ["x"], "hammer.angle_deg": [9.0]}, "over.hammer.direction must be left out with hammer."),
+    ({"contact.friction": [[1.0]]}, "over.contact.friction.values must be a list of 1 to 1000000 numbers"),
+    ({"contact.friction": [float("nan")]}, "over.contact.friction.values must be a list of 1 to 1000000 numbers"),
     ({"contact.friction": ["0.3 mm"]}, "over.contact.friction must be a number from 0 to 2; received '0.3 mm'"),
     ({"contact.friction": [99.0]}, "over.contact.friction must be a number from 0 to 2; received 99.0"),
     ({"contact.friction": {"from": "0.1 mm", "to": 1, "count": 3}}, "over.contact.friction.from must be a valid"),
@@ -188,3 +193,11 @@ def test_wrong_designs_are_refused() -> None:
         with pytest.raises(InputError) as caught:
             create(over, sampling, runs)
         assert str(caught.value).startswith(line)
+
+
+def test_a_frozen_distribution_is_of_one_finite_number() -> None:
+    from scipy import stats
+
+    for wrong in (stats.norm([0.1, 0.2], 0.1), stats.norm(0.2, -1.0)):
+        with pytest.raises(InputError, match=r"^over\.contact\.friction\.distribution must be a distribution of one"):
+            Design.create(load_scene("hammer"), {"contact.friction": wrong}, runs=4, sampling=None, seed=1)

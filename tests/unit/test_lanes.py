@@ -296,3 +296,16 @@ def test_a_refused_combination_fails_alone_and_a_wrong_value_is_refused() -> Non
         batch.run([[0.01, -5.0]])
     with pytest.raises(InputError, match=r"^drive\.speed_hz must be at most drive\.top_speed = 15 Hz; received 15\.5"):
         Batch(scene, ["drive.speed_hz"]).run([[15.5]])
+
+
+def test_a_batch_may_be_empty_and_has_one_shape() -> None:
+    batch = Batch(rig.load_scene("hammer"), ["contact.friction"])
+    assert len(batch.run([])["outcome"]) == 0
+    with pytest.raises(InputError, match=r"^values must be an array of shape \(runs, 1\); received shape \(1, 3\)"):
+        batch.run([[0.1, 0.2, 0.3]])
+
+
+def test_a_short_pulse_without_contact_is_trusted() -> None:
+    scene = rig.load_scene("hammer", {"duration_s": 0.1})
+    table = Batch(scene, ["hammer.duration_ms"]).run([[0.5]], repeat=False)
+    assert (table["outcome"][0], table["contacts"][0], table["trusted"][0]) == ("free", 0.0, True)
