@@ -13,11 +13,12 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event
 from typing import Any
 
-from rig.base.checks import read_json
+from rig.base.checks import describe_error, read_json
 from rig.base.errors import InputError, Words
 from rig.base.files import PART_SUFFIX, Closing, lock_folder, open_output, read_file, write_file
 from rig.ensemble.ensemble import Ensemble, Workers, iterate_results, simulate_runs
@@ -106,7 +107,11 @@ class Sweep(Closing):
         for draft in folder.glob(f"*.*{PART_SUFFIX}"):  # of a killed sweep
             draft.unlink()
         finished = {path.name for path in list_parts(folder)}
-        self.missing = [task for task in range(work.tasks) if self.find_part(task).name not in finished]
+        # A part that was damaged or replaced is simulated again.
+        self.missing = [
+            task for task in range(work.tasks)
+            if (path := self.find_part(task)).name not in finished or not is_intact(path, work.find_range(task))
+        ]  # fmt: skip
 
     def close(self) -> None:
         """Release the lock."""
@@ -170,6 +175,32 @@ def list_parts(folder: Path) -> list[Path]:
     return sorted(folder.glob("part-*.parquet"))
 
 
+def is_intact(path: Path, runs: tuple[int, int]) -> bool:
+    """Return whether a part is a Parquet file of some runs, given as the first number and that after the last."""
+    from pyarrow import parquet
+
+    try:
+        found = parquet.read_metadata(path)
+        numbers = found.row_group(0).column(0).statistics
+        return (numbers.min, numbers.max, found.num_rows) == (runs[0], runs[1] - 1, runs[1] - runs[0])
+    except (OSError, ValueError, RuntimeError, AttributeError):
+        return False
+
+
+@contextmanager
+def _reading(folder: Path) -> Iterator[None]:
+    """Report what is wrong in the files of a sweep as an error of its folder."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (LookupError, TypeError, ValueError, ArithmeticError, IsADirectoryError) as error:
+        received = Words(f"{folder} ({describe_error(error)})")
+        raise InputError(
+            "FOLDER", "a folder of `rig sweep` with intact files (--resume mends parts)", received
+        ) from None
+
+
 def open_sweep(folder: str | Path, columns: Sequence[str] | None = None) -> Ensemble:
     """Return the finished runs of a sweep.
 
@@ -188,11 +219,23 @@ def open_sweep(folder: str | Path, columns: Sequence[str] | None = None) -> Ense
     """
     from pyarrow import dataset
 
-    design = load_work(read_plan_text(Path(folder))).design
-    if not (parts := list_parts(Path(folder))):
-        raise InputError("folder", "one with a finished part", str(folder))
-    table = dataset.dataset(parts).to_table(columns=None if columns is None else list(columns))
-    return Ensemble(table, design.axes, design.shape)
+    path = Path(folder)
+    with _reading(path):
+        work = load_work(read_plan_text(path))
+        if not (parts := _check_parts(path, work.document)):
+            raise InputError("folder", "one with a finished part", str(folder))
+        table = dataset.dataset(parts).to_table(columns=None if columns is None else list(columns))
+    return Ensemble(table, work.design.axes, work.design.shape)
+
+
+def _check_parts(folder: Path, document: dict[str, Any]) -> list[Path]:
+    """Return the finished parts; raise a ValueError for one that is damaged."""
+    parts, size, runs = list_parts(folder), document["task_runs"], document["runs"]
+    for path in parts:
+        first = int(path.stem.rpartition("-")[2]) * size
+        if not is_intact(path, (first, min(first + size, runs))):
+            raise ValueError(f"{path.name} is damaged")
+    return parts
 
 
 def summarise(folder: Path) -> dict[str, Any]:
@@ -201,10 +244,14 @@ def summarise(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: The folder is not of a sweep.
     """
+    with _reading(folder):
+        return _summarise(folder, read_json(read_plan_text(folder).encode(), field=_PLAN))
+
+
+def _summarise(folder: Path, document: dict[str, Any]) -> dict[str, Any]:
     from pyarrow import dataset
 
-    document = read_json(read_plan_text(folder).encode(), field=_PLAN)
-    parts, outcomes, untrusted = list_parts(folder), Counter[str](), 0
+    parts, outcomes, untrusted = _check_parts(folder, document), Counter[str](), 0
     for batch in dataset.dataset(parts).to_batches(columns=["outcome", "trusted"]) if parts else ():
         counts = batch["outcome"].value_counts().to_pylist()
         outcomes.update({each["values"]: each["counts"] for each in counts})
@@ -212,11 +259,9 @@ def summarise(folder: Path) -> dict[str, Any]:
     seconds = {}
     if (folder / _LOG).exists():
         for line in read_file(folder / _LOG, _MAX_BYTES).decode().splitlines():
-            try:
+            with suppress(InputError, KeyError, TypeError):  # a line of a killed sweep
                 report = read_json(line.encode())
-            except InputError:  # written by a killed sweep
-                continue
-            seconds[report["task"]] = report["seconds"]
+                seconds[report["task"]] = report["seconds"]
     return {
         "title": document["title"], "scene": document["scene"]["name"], "over": [*document["over"]],
         "tasks_done": len(parts), "tasks": -(-document["runs"] // document["task_runs"]),

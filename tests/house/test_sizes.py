@@ -47,7 +47,7 @@ BUDGETS = {
     "rig/base": 1064,
     "rig/channels": 2452,
     "rig/cli": 5768,
-    "rig/ensemble": 1987,
+    "rig/ensemble": 2019,
     "rig/physics": 5488,
     "rig/run": 1893,
     "rig/serve": 3019,

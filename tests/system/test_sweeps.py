@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -278,3 +279,22 @@ def test_a_plan_needs_no_other_file_on_its_workers(tmp_path: Path) -> None:
     ours = plans.load_work(work.text).scene.load_parameters()
     assert ours["contact.friction"] == 0.11
     assert ours.numbers() == rig.load_parameters("as-printed").override({"contact.friction": 0.11}).numbers()
+
+
+def test_damaged_parts_are_reported_and_simulated_again(
+    plan: Path, parts: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "out"
+    shutil.copytree(plan.parent / "one", folder)
+    (folder / "part-00003.parquet").write_bytes(parts["part-00003.parquet"][:500])
+    status, _, err = call(capsys, "sweep", "info", folder)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "with intact files (--resume mends parts); received" in err
+    assert "part-00003.parquet is damaged" in err
+    (folder / "part-00005.parquet").write_bytes(parts["part-00004.parquet"])  # runs of another task
+    assert call(capsys, "sweep", plan, "-o", folder, "--resume")[0] == 0
+    assert read_parts(folder) == parts
+    (folder / "plan.json").write_text('{"task_runs": 0}', encoding="utf-8")
+    with pytest.raises(InputError, match=r"^FOLDER must be a folder of `rig sweep` with intact files"):
+        rig.open_sweep(folder)
+    assert call(capsys, "sweep", "info", folder)[0] == 2
