@@ -11,7 +11,7 @@ import pytest
 
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.explanations.faults import sensor_faults
-from replays.recordings.validation.explanations.signals import edge_faults, signal_faults, steady_rows
+from replays.recordings.validation.explanations.signals import edge_faults, is_quiet, signal_faults, steady_rows
 from rig.channels.table import default_table
 
 RATE_HZ, ROWS = 20_000, 6000
@@ -139,6 +139,20 @@ def test_faults_visible_without_a_prediction() -> None:
     assert (frozen.from_s, frozen.to_s) == (pytest.approx(0.1), pytest.approx(0.11495))
 
 
+def test_noise_is_judged_before_the_first_contact_only() -> None:
+    """A rub looks like noise of an accelerometer; few rows before it show no noise at all."""
+    part, _ = make_signals("forces")
+    values = part.values.copy()
+    values[200:, 2] += 8.0 * part.floor[2] * np.random.default_rng(0).standard_normal(ROWS - 200)
+    rubbed = {"forces": replace(part, values=values)}
+    assert [one.what for one in signal_faults(rubbed)] == ["noise"]
+    assert signal_faults(rubbed, 200 / RATE_HZ) == []
+    assert not is_quiet(rubbed["forces"], 50 / RATE_HZ)
+    values[:, 2] = 1e3 * values[:, 2]
+    assert signal_faults(rubbed, 50 / RATE_HZ) == []
+    assert [one.to_s for one in signal_faults(rubbed, 200 / RATE_HZ)] == [pytest.approx(199 / RATE_HZ)]
+
+
 def test_coarse_numbers_are_not_stuck() -> None:
     part, _ = make_signals("drive")
     values = np.round(part.values, 1)
@@ -151,6 +165,11 @@ def test_pulses() -> None:
     assert edge_faults(edges_s, 6.0, 6.2) == []
     assert "miss-pulses: in 1 of" in edge_faults(np.delete(edges_s, 7), 6.0, 6.2)[0].line
     assert "extra-pulses: 2 pulses per turn" in edge_faults(np.arange(40) / 12.4, 6.0, 6.2)[0].line
+    sampled_s = np.ceil(5000.0 * edges_s) / 5000.0  # without a filter, an edge is up to a sample late
+    assert edge_faults(sampled_s, 6.0, 6.2, period_s=1.0 / 5000.0) == []
+    assert "missing or doubled" in edge_faults(sampled_s - 0.001 * (edges_s > 3.0), 6.0, 6.2, period_s=2e-4)[0].line
+    assert "none in 3.1 turns" in edge_faults(edges_s[:0], 0.5, 6.2, from_s=0.0)[0].line
+    assert edge_faults(edges_s[:0], 0.2, 6.2, from_s=0.0) == edge_faults(edges_s[:0], 0.5, 6.2) == []
 
 
 @pytest.mark.parametrize(("change_s", "line"), [

@@ -1048,3 +1048,25 @@ def test_all_versions_of_mdf_are_read(version: str, tmp_path: Path) -> None:
     assert list(found) == kinds
     for values in found.values():
         np.testing.assert_array_equal(values, t > 0.05)
+
+
+def test_a_record_without_a_keyphasor_pulse_has_no_edges() -> None:
+    """A log that begins after a pulse and ends before the next one has noise only; so has a flank cut by its start."""
+    rng = np.random.default_rng(1)
+    turn = np.zeros(20_000)
+    turn[8_000:8_500] = 1.0
+    flanks = np.convolve(turn, np.full(200, 0.005), "same")
+    even = clock.TimeAxis(0.0, 1000.0, len(turn))
+
+    def edges(values: np.ndarray) -> list[int]:
+        return np.rint(1000.0 * clock.find_crossings(values, even, threshold=None, hysteresis=None)[0]).tolist()
+
+    for noise in (1e-4, 0.01):
+        shown = flanks + noise * rng.standard_normal(len(turn))
+        assert edges(shown[9_000:]) == edges(shown[:400]) == []
+        assert len(edges(shown)) == len(edges(shown[7_995:])) == len(edges(shown[7_950:])) == 1
+        assert all(not edges(shown[at:]) for at in range(8_400, 8_530))
+    bipolar = np.gradient(flanks) + 1e-4 * rng.standard_normal(len(turn))
+    sine = np.sin(0.01 * np.arange(len(turn))) + 0.01 * rng.standard_normal(len(turn))
+    assert len(edges(bipolar)) > 0
+    assert len(edges(sine)) in (31, 32)

@@ -165,6 +165,17 @@ def test_a_contradicting_channel_is_ignored() -> None:
     np.testing.assert_allclose(alone, [-150.0, 100.0], rtol=0.1)
 
 
+def test_a_short_log_blames_no_channel_for_another_friction(tmp_path: Path) -> None:
+    """20 ms before the hammer pulse have no keyphasor pulse, and the rub after it is no noise of a sensor."""
+    motion = second_rig.simulate_pulse(second_rig.Rig(mu=0.1), turned=4.0, before_s=0.02, after_s=0.05, settled_s=3.0)
+    log = import_all_channels(tmp_path, motion, seed=5)
+    assert not len(log.edges())
+    found = validate(log)
+    assert found.faults == ()
+    assert found.explained is not None
+    assert "--fit contact.friction" in found.explained.conclusion
+
+
 def test_an_aligned_log_passes(tmp_path: Path) -> None:
     motion = second_rig.simulate_pulse(turned=TURNED, before_s=0.2, after_s=0.1, settled_s=2.0)
     found = validate(import_all_channels(tmp_path, motion, seed=8))

@@ -288,6 +288,17 @@ def test_a_repeated_sample_of_a_whirl_keeps_one_start_for_all_channels(tmp_path:
     assert red(judge(file, [sent.path], path="analogue")) == {("doubled samples", "")}
 
 
+def test_lost_samples_are_found_beside_a_late_input(tmp_path: Path) -> None:
+    """A late input is explained by no start; it must not decide for a start at which the signal nearly repeats."""
+    sent = Sessions(tmp_path / "sessions").get("test-two-tone", first_s=61.0)
+    box = Converter(61.05, 12_000, ppm=30.0, skew_s=np.array([-8e-4, 0.0, 0.0, 0.0]))
+    volts = np.delete(box.volts(sent, np.random.default_rng(1)), np.arange(9000, 9016), axis=0)
+    columns = dict(list(make_columns(sent, volts, "unit").items())[:3])
+    file = write_values("parquet", tmp_path / "daq", columns, np.arange(len(volts)) / RATE_HZ, RATE_HZ)
+    card = judge(file, [sent.path], path="analogue", channels=list(columns))
+    assert (card.row("lost samples", "").value, card.runs["lost samples"]) == (16, [(9000, 9000)])
+
+
 def test_rows_before_a_frozen_channel_stay_inside_the_session(tmp_path: Path) -> None:
     """A fault of 10 ms on one channel spoils no fit of the rest of a sine, and hides no rows."""
     sent = Sessions(tmp_path / "sessions").get("test-sine")

@@ -31,6 +31,11 @@ FILTER = (
 )
 
 
+_NOISE_BAND, _MAX_BAND_PART, _NOISE_RANGE = 0.1, 0.4, 9.0
+"""Signal without a pulse: more than this part is within this part of the range from its middle (0.13 of a sine, 0.2 of
+a ramp, 0.45 or more of noise), and the range is below this multiple of the interquartile one (bipolar pulses: more)."""
+
+
 @dataclass(frozen=True)
 class TimeAxis:
     """Time axis of a signal.
@@ -191,27 +196,41 @@ def find_crossings(
         falling: Find falling instead of rising crossings.
 
     Returns:
-        Instants [s], shape (k,), and the level.
+        Instants [s], shape (k,), and the level. Without a threshold, a signal of noise alone has none.
     """
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     level = 0.5 * (low + high) if threshold is None else threshold
     back = 0.1 * (high - low) if hysteresis is None else hysteresis
+    if threshold is None and high > low and _is_noise(values, level, high - low):
+        return np.empty(0), level
     sign = -1.0 if falling else 1.0
     signal = sign * (np.nan_to_num(values, nan=low) - level)
     upward = np.flatnonzero((signal[:-1] < 0.0) & (signal[1:] >= 0.0))
     if not len(upward):
         return np.empty(0), level
-    # A crossing counts if the signal has been below the hysteresis band since the previous one.
+    # A crossing counts if the signal has been below the hysteresis band since the previous one. The first row may be on
+    # a rising flank, from which the band is left upwards, or on a falling one, where noise crosses the level.
+    outside = np.flatnonzero(np.abs(signal) > back)[:1]
+    rising = int(outside[0]) if len(outside) and signal[outside[0]] > 0.0 else 0
     below = np.concatenate([[0], np.cumsum(signal < -back)])
     kept, last = [], -1
     for at in upward.tolist():
-        if last < 0 or below[at + 1] > below[last + 1]:
+        if below[at + 1] > below[last + 1] or (last < 0 and at < rising):
             kept.append(at)
             last = at
-    at = np.array(kept)
+    at = np.array(kept, dtype=int)
     times_s = axis.instants()
     part = -signal[at] / (signal[at + 1] - signal[at])
     return times_s[at] + part * (times_s[at + 1] - times_s[at]), level
+
+
+def _is_noise(values: np.ndarray, level: float, spread: float) -> bool:
+    """Return whether a signal has no pulse: it is spread about the middle of its range, as noise is."""
+    held = values[np.isfinite(values)]
+    low, high = np.quantile(held, (0.25, 0.75))
+    return float(np.mean(np.abs(held - level) < _NOISE_BAND * spread)) > _MAX_BAND_PART and bool(
+        spread < _NOISE_RANGE * (high - low)
+    )
 
 
 @dataclass(frozen=True)

@@ -283,7 +283,9 @@ def _edges(log: Log, zero_s: float, groups: dict[str, PlacedGroup]) -> np.ndarra
     edges_s, level = clock.find_crossings(
         values, axis, threshold=wanted.threshold, hysteresis=wanted.hysteresis, falling=wanted.edge == "falling"
     )
-    if not len(edges_s):
+    if not len(edges_s) and wanted.threshold is None:
+        log.remarks.append(f"no keyphasor pulse: {entry.name} stays within its noise")
+    elif not len(edges_s):
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
         raise InputError("keyphasor.threshold", f"between {low:.4g} and {high:.4g}, the ends of {entry.name}", level)
     edges_s = edges_s[:: wanted.pulses_per_turn]

@@ -30,7 +30,7 @@ from replays.recordings.validation.explanations.attribution import (
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import find_common_delay, select_channels
 from replays.recordings.validation.explanations.model_parameters import find_changes
-from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, signal_faults
+from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, is_quiet, signal_faults
 from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import CONTACT, PHASES, Phase
@@ -89,12 +89,20 @@ def validate(
     if moves:
         step("statistics by phase, and their spread")
         phases, judged = statistics(again.quick, again.parts, again.nominal, tables, again.criteria, again.members)
+    remarks = calibration(recording, experiment)
+    touched = next((one.from_s for one in phases if one.name in CONTACT), math.inf)
+    if again.tuned is not None and not first_command_s(experiment) and touched < math.inf:
+        sound = tuple(one for one in again.faults if one.what != "noise" or one.to_s <= touched)
+        again = replace(again, faults=sound, unjudged=tuple(again.parts))
+    if again.unjudged:
+        text = f"noise of {', '.join(again.unjudged)} not compared: too few rows before the first contact"
+        remarks = ["; ".join([*remarks, text])]
     validation = Validation(
         path=recording.path, scene=experiment.scene.name, criteria=again.criteria.title, changes=dict(changes or {}),
         bits=again.bits, bit_exact=bool(again.bits) and all(one.equal for one in again.bits.values()),
         declared=declared, window_s=(begin, end), window_reason=reason, residuals=tuple(trajectory),
         truth=tuple(truth), phases=tuple(phases), statistics=tuple(judged),
-        calibration=tuple(calibration(recording, experiment)),
+        calibration=tuple(remarks),
         skipped=sum(rows for rows, _ in lost.values())
         or sum(one.skipped for one in again.bits.values())
         or sum(stream.lost - stream.declared for stream in recording.streams.values()),
@@ -180,6 +188,7 @@ class _Resimulation:
         tuned: Fit of an imported log.
         faults: Faults that the signals of an imported log show without a model.
         members: Ensemble of an imported log: equally good fits of equally valid models; otherwise made from `quick`.
+        unjudged: Groups of a log whose noise cannot be judged, as too few rows precede the hammer pulse.
         own: Defects of single channels whose counts differ while others are equal to the bit.
         same_motion: Whether the truth is equal, which excludes other causes.
     """
@@ -193,6 +202,7 @@ class _Resimulation:
     tuned: Tuned | None
     members: tuple[Prediction, ...] = ()
     faults: tuple[SignalFault, ...] = ()
+    unjudged: tuple[str, ...] = ()
     own: tuple[Explanation, ...] = ()
     same_motion: bool = False
 
@@ -260,10 +270,16 @@ def _resimulate_log(
         # The phase of the pulses is unknown: a pulse is possible at any time.
         others.insert(1, _replace_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
     drawn = [models[n % len(models)].draw_values(generator) for n in range(criteria.ensemble.members)]
-    faults = signal_faults(whole)
-    faults += edge_faults(recording.edges(), until_s, tuned.baseline.scene.drive.speed_hz)
+    faults = signal_faults(whole, until_s)
+    key = next((name for name, part in whole.items() if "keyphasor" in part.names), min(whole))
+    mapped = "keyphasor" in recording.scene["import"]["mapping"]
+    faults += edge_faults(
+        recording.edges(), min(until_s, float(whole[key].times_s[-1])), tuned.baseline.scene.drive.speed_hz,
+        from_s=float(whole[key].times_s[0]) if mapped else math.inf, period_s=1.0 / whole[key].channels[0].rate_hz,
+    )  # fmt: skip
     return _Resimulation(
         faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
+        unjudged=tuple(name for name, part in whole.items() if not is_quiet(part, until_s)),
         quick=simplify(tuned.experiment), criteria=criteria.for_log(),
         parts=tuned.to_model_clock(parts),
         nominal=nominal, others=tuple(others), bits={}, tuned=tuned,

@@ -45,6 +45,9 @@ _OUTLIER_RATIO, _MAX_OUTLIER_PART = 10.0, 0.2
 """Residual over the median one above which a row is faulty, and the largest part of faulty rows."""
 _STRETCH_QUANTILE = 0.25
 """Quantile of the stretches by which starts are compared: the correct one explains none after a lost sample."""
+_MAX_LEFT, _MAX_LEFT_RATIO = 1e-3, 100.0
+"""Part of a signal's power that is left by the best start, absolute and relative to the first signal's, above which the
+signal is late or faulty."""
 _STRETCHES = 6
 """Parts of a record, each with one stretch that is compared before the record is followed."""
 
@@ -222,9 +225,16 @@ class Candidates:
         return round(2.0 * max(0.0, busy) - inside)
 
     def _stretch_excess(self) -> np.ndarray:
-        """Return the logarithm of each start's residual power over the least one, by its best stretches."""
+        """Return the logarithm of each start's residual power over the least one, by its best stretches.
+
+        A signal that no start explains, as a late input, distinguishes none.
+        """
+        residuals = np.array(self._residuals)
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # all-nan: unexplained stretches
-            apart = np.log(np.array(self._residuals) / np.nanmin(self._residuals, axis=0))
+            powers = [np.nanvar(each.values) for each in self._compared[: residuals.shape[1]]]
+            left = np.nanmedian(np.nanmin(residuals, axis=0), axis=1) / powers
+            shows = (left <= _MAX_LEFT) | (left <= _MAX_LEFT_RATIO * left[0])
+            apart = np.log(residuals / np.nanmin(residuals, axis=0))[:, shows]
             return np.nanmean(np.nanquantile(apart, _STRETCH_QUANTILE, axis=2), axis=1)
 
     def follow_candidates(self, shifts: Sequence[float]) -> None:

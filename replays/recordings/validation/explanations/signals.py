@@ -19,6 +19,10 @@ _RAIL_RUN, _RAIL_ROWS = 2, 4
 """Fewest rows at the largest or smallest number for a rail: consecutive, and in all."""
 _UNEVENNESS, _UNEVENNESS_S = 8.0, 5e-5
 """Deviation of an uneven turn: in standard deviations of turns, and absolute."""
+_EDGE_SAMPLES = 1.05
+"""Deviation of a turn between edges that are sampled without a filter [samples]: one, and rounding."""
+_SILENT_TURNS = 2.0
+"""Turns without any pulse at which pulses are missing."""
 _MISSED_TURN = 1.6
 """Length of a turn relative to both neighbours above which a pulse is missing."""
 _PULSE_TOLERANCE = 0.2
@@ -27,6 +31,8 @@ _JUMP_FACTOR, _JUMP_QUANTILE = 10.0, 0.995
 """Second difference of a probe in a jump, relative to this quantile of all; inertia prevents it in a motion."""
 _NOISE_FACTOR = 3.0
 """Noise of a faulty channel relative to that of similar ones."""
+_MIN_QUIET_ROWS = 64
+"""Fewest rows that show a noise to a tenth, far below the factor above."""
 
 
 class SignalFault(NamedTuple):
@@ -61,26 +67,34 @@ def steady_rows(values: np.ndarray, held: int = _MIN_FROZEN_ROWS) -> np.ndarray:
     return steady
 
 
-def signal_faults(parts: dict[str, Measured]) -> list[SignalFault]:
+def signal_faults(parts: dict[str, Measured], quiet_s: float = math.inf) -> list[SignalFault]:
     """Return the defects that channels show without a model.
 
     Args:
         parts: Recorded channels, in their whole length.
+        quiet_s: Time up to which the shaft touches nothing [s]; a rub looks like noise of an accelerometer.
     """
     faults = []
     for part in parts.values():
         faults += _find_jumps(part)
-        noises = [measure_noise(part.values[:, c]) for c in range(len(part.channels))]
+        quiet = part.values[: part.count_rows(quiet_s)]
+        noises = [measure_noise(quiet[:, c]) for c in range(len(part.channels))] if is_quiet(part, quiet_s) else []
         for c, channel in enumerate(part.channels):
             if channel.signal == "keyphasor":
                 continue  # a pulse is steady, and has rails
             faults += _find_held_values(channel.name, channel.unit, part.times_s, part.values[:, c])
-            peers = [noises[k] for k, other in enumerate(part.channels) if k != c and other.unit == channel.unit]
+            peers = [one for k, one in enumerate(noises) if k != c and part.channels[k].unit == channel.unit]
             if peers and noises[c] > _NOISE_FACTOR * max(peers):
                 times = noises[c] / float(np.median(peers))
                 text = f"{times:.2g} times that of similar channels"
-                faults.append(SignalFault(channel.name, "noise", float(part.times_s[0]), float(part.times_s[-1]), text))
+                end_s = float(part.times_s[len(quiet) - 1])
+                faults.append(SignalFault(channel.name, "noise", float(part.times_s[0]), end_s, text))
     return faults
+
+
+def is_quiet(part: Measured, quiet_s: float) -> bool:
+    """Return whether a part of a recording before a time is long enough to show the noise."""
+    return part.count_rows(quiet_s) >= _MIN_QUIET_ROWS
 
 
 def _find_jumps(part: Measured) -> list[SignalFault]:
@@ -103,14 +117,21 @@ def _find_jumps(part: Measured) -> list[SignalFault]:
     return [SignalFault("time", "lost samples", begin, end, text)]
 
 
-def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[SignalFault]:
+def edge_faults(
+    edges_s: np.ndarray, until_s: float, speed_hz: float, *, from_s: float = math.inf, period_s: float = 0.0
+) -> list[SignalFault]:
     """Return missing or extra pulses at constant speed, and missing ones after that.
 
     Args:
         edges_s: Keyphasor edges [s].
         until_s: End of the constant speed [s].
         speed_hz: Speed [Hz].
+        from_s: Start of a keyphasor's record [s].
+        period_s: Sampling period of the keyphasor, whose edges may be up to a sample off [s].
     """
+    if not len(edges_s) and (until_s - from_s) * speed_hz > _SILENT_TURNS:
+        text = f"none in {(until_s - from_s) * speed_hz:.1f} turns"
+        return [SignalFault("keyphasor", "miss-pulses", from_s, until_s, text)]
     steps, faults = np.diff(edges_s[edges_s < until_s]), list[SignalFault]()
     even = len(steps) if len(steps) >= 3 else 0
     later = np.diff(edges_s[max(0, even - 1) :])
@@ -135,7 +156,8 @@ def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[Si
             text = f"in {len(at)} of {len(steps)} turns, the first at {begin:.3f} s"
             faults.append(SignalFault("keyphasor", what, begin, end, text))
     off_s = np.where(np.abs(turns - 1.0) < 0.3, steps - np.median(steps), 0.0)
-    for at in np.flatnonzero(np.abs(off_s) > max(_UNEVENNESS * 1.5 * float(np.median(np.abs(off_s))), _UNEVENNESS_S)):
+    least_s = max(_UNEVENNESS * 1.5 * float(np.median(np.abs(off_s))), _UNEVENNESS_S, _EDGE_SAMPLES * period_s)
+    for at in np.flatnonzero(np.abs(off_s) > least_s):
         text = f"the turn that ends at {edges_s[at + 1]:.4f} s is longer than the others by {1e3 * off_s[at]:+.4g} ms: "
         text += "samples are missing or doubled in it" if off_s[at] < 0.0 else "its time jumps"
         faults.append(SignalFault("time", "lost samples", float(edges_s[at]), float(edges_s[at + 1]), text))
