@@ -226,11 +226,11 @@ def write_file(path: Path, data: str | bytes, *, sync: bool = False) -> None:
     Raises:
         DiskError: The disk refused; an existing file stays unchanged.
     """
-    with whole_file(path) as draft, open_output(draft, "wb") as file:
-        file.write(data.encode() if isinstance(data, str) else data)
+    with whole_file(path) as draft:
+        draft.write_bytes(data.encode() if isinstance(data, str) else data)
         if sync:
-            file.flush()
-            os.fsync(file.fileno())
+            with draft.open("rb+") as file:
+                os.fsync(file.fileno())
 
 
 def lock_folder(folder: Path, what: str) -> int:

@@ -126,7 +126,7 @@ def _coefficients() -> tuple[Any, ...]:
 _A, _B, _COARSE, _FINE = _coefficients()
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy", fastmath=False)
 def _sine_cosine(x):
     """Return sine and cosine, exact to rounding for |x| < 1e5, without a call or a branch."""
     n = (x * _PER_QUARTER + _MAGIC) - _MAGIC
@@ -148,7 +148,7 @@ def _sine_cosine(x):
     return first, second
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy", fastmath=False)
 def _positive(x):
     """Return max(0, x), which the compiler takes for all lanes at once."""
     return x if x > 0.0 else 0.0
@@ -879,7 +879,7 @@ def _finish(m, own, i, status, result):
         mine[WATCHED_CONTACT] = mine[CONTACT_TIME] - (now - own[_MARK_TIME, i])
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy", fastmath=False)
 def _step_factor(error):
     """Return the factor of the next step by its error: 0.9 error^(-1/8)."""
     return 0.9 / math.sqrt(math.sqrt(math.sqrt(error)))

@@ -46,7 +46,7 @@ BUDGETS = {
     "rig": 64,
     "rig/base": 1064,
     "rig/channels": 2452,
-    "rig/cli": 5768,
+    "rig/cli": 5769,
     "rig/ensemble": 2019,
     "rig/physics": 5488,
     "rig/run": 1893,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from rig.base.errors import InputError, Words
-from rig.cli.options import Json
+from rig.cli.options import Json, Wide
 from rig.cli.output.folder import check_folder
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import echo, echo_json, fact_table, new_table, table_console
@@ -30,6 +30,7 @@ def map(
     quick: Annotated[bool, typer.Option("--quick", help="Wider border cells, fewer runs")] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of threads; default: the cores")] = None,
     listing: Annotated[bool, typer.Option("--list", help="List the ready plans")] = False,
+    wide: Wide = False,
     as_json: Json = False,
 ) -> None:
     """Map the outcome of a scene over two of its values, with the borders found.
@@ -40,17 +41,17 @@ def map(
     """
     first, *rest = arguments or [""]
     if listing or not first:
-        _list_plans(as_json=as_json)
+        _list_plans(wide=wide, as_json=as_json)
         return
     names = _ACTIONS.get(first, ())
     if len(rest) != len(names):
         raise InputError("arguments", f"{first} {' '.join(names)}".strip(), Words(" ".join((first, *rest))))
     if first == "info":
-        _show_info(Path(rest[0]), as_json=as_json)
+        _show_info(Path(rest[0]), wide=wide, as_json=as_json)
     elif first == "pick":
         _pick(Path(rest[0]), rest[1:], panel, output)
     elif first == "sobol":
-        _show_indices(Path(rest[0]), workers, as_json=as_json)
+        _show_indices(Path(rest[0]), workers, wide=wide, as_json=as_json)
     else:
         _make(first, output, workers, quick=quick, as_json=as_json)
 
@@ -90,10 +91,10 @@ def _make(name: str, output: Path | None, workers: int | None, *, quick: bool, a
         band = find_band(work, pool, step) if work.plan.band_runs else None
         save(draw_map(found, band), *(output / f"map{suffix}" for suffix in (".png", ".svg")), source=work.plan.title)
         echo(f"{state['done']} runs in {time.monotonic() - begin:.0f} s, {found.resumed} found in {output}", err=True)
-    _show_info(output, as_json=as_json)
+    _show_info(output, wide=False, as_json=as_json)
 
 
-def _list_plans(*, as_json: bool) -> None:
+def _list_plans(*, wide: bool, as_json: bool) -> None:
     from replays.studies.maps.plan import plan_names, read_map_plan
 
     plans = {name: read_map_plan(name).plan for name in plan_names()}
@@ -103,7 +104,7 @@ def _list_plans(*, as_json: bool) -> None:
     table = new_table("ready plans: rig map PLAN -o FOLDER", "plan", "title", "x", "y", wrapped=("title",))
     for name, plan in plans.items():
         table.add_row(name, plan.title, plan.x.key, plan.y.key)
-    table_console().print(table)
+    table_console(wide=wide).print(table)
 
 
 def _pick(folder: Path, place: list[str], panel: float | None, output: Path | None) -> None:
@@ -121,7 +122,7 @@ def _pick(folder: Path, place: list[str], panel: float | None, output: Path | No
     echo(f"{output}: rig run {output}")
 
 
-def _show_info(folder: Path, *, as_json: bool) -> None:
+def _show_info(folder: Path, *, wide: bool, as_json: bool) -> None:
     from replays.studies.maps.results import read_summary
 
     state = read_summary(folder)
@@ -152,10 +153,10 @@ def _show_info(folder: Path, *, as_json: bool) -> None:
         rows.append(("check", f"{counts}: share below {check['error_share_below_95']:.2%} (95 %)"))
     if "smallest" in state:
         rows.append((state["quantity"], f"{state['smallest']:.4g} to {state['largest']:.4g}"))
-    table_console().print(fact_table(state["title"], rows))
+    table_console(wide=wide).print(fact_table(state["title"], rows))
 
 
-def _show_indices(plan: Path, workers: int | None, *, as_json: bool) -> None:
+def _show_indices(plan: Path, workers: int | None, *, wide: bool, as_json: bool) -> None:
     from replays.studies.maps.sobol import find_indices
     from rig.ensemble.ensemble import local_workers
     from rig.ensemble.plan import read_plan
@@ -172,4 +173,4 @@ def _show_indices(plan: Path, workers: int | None, *, as_json: bool) -> None:
         cells = [text for kind in ("first", "total") for low, high in [each[f"{kind}_95"]]
                  for text in (f"{each[kind]:.3f}", f"{low:.3f} to {high:.3f}")]  # fmt: skip
         table.add_row(key, *cells)
-    table_console().print(table)
+    table_console(wide=wide).print(table)
