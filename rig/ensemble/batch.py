@@ -28,7 +28,7 @@ from rig.physics.parameters import SI
 from rig.run.motion import WATCHED_S, initial_state
 from rig.run.scenes import Scene, change_scene
 from rig.run.simulation import TICK_RATE_HZ, Simulation
-from rig.run.speed_target import Segment, segments
+from rig.run.speed_target import ramp, segments
 
 TOLERANCE = 1e-6
 """Scaled error per step of the batch kernel at the default engine.tolerance; a finer one makes it proportionally finer.
@@ -111,10 +111,7 @@ class _Plan:
         """Ramp the drive to a speed at its ramp rate."""
         segment = next(each for each in reversed(self._segments) if each.tick <= self.tick)
         now = segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
-        target = 2.0 * math.pi * speed_hz
-        length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
-        slope = (target - now) / max(length, 1) * TICK_RATE_HZ
-        self._segments = [Segment(self.tick, now, slope)] * (length > 0) + [Segment(self.tick + length, target, 0.0)]
+        self._segments = ramp(self.tick, now, speed_hz, self.model.parameters["drive.ramp_rate"], TICK_RATE_HZ)
 
     def release_magnets(self) -> None:
         """Switch the magnets off."""
@@ -383,14 +380,14 @@ class Batch:
             changes["engine.tolerance"] = _REPEAT_TOLERANCE
         scene = change_scene(scene, changes)
         simulation = Simulation(scene)
-        first, parts = simulation.first_row, []
+        parts = []
         try:
             while simulation.tick < simulation.end_tick:
                 chunk = min(100 * simulation.block_ticks, simulation.end_tick - simulation.tick)
                 parts.append(simulation.advance(chunk).rows[:, _COLUMNS].copy())
         except SimulationError:
             return {"outcome": "failed", "trusted": False, "engine": scene.engine.name}
-        return _quantities_of_rows(simulation, np.concatenate(parts), first)
+        return _quantities_of_rows(simulation, np.concatenate(parts))
 
 
 _PLAIN_FIELDS = {
@@ -476,7 +473,7 @@ def _compare(table: dict[str, np.ndarray], finer: dict[str, np.ndarray]) -> None
     table["trusted"] &= same
 
 
-def _quantities_of_rows(simulation: Simulation, rows: np.ndarray, first: np.ndarray) -> dict[str, Any]:
+def _quantities_of_rows(simulation: Simulation, rows: np.ndarray) -> dict[str, Any]:
     """Return the quantities of a finished run from its rows."""
     health, memory = simulation.health(), simulation._motion.memory  # noqa: SLF001
     end_s, step_s = simulation.tick / TICK_RATE_HZ, simulation.row_ticks / TICK_RATE_HZ

@@ -814,8 +814,8 @@ def _outcome_is_certain(m, own, i, batch):
     """Return the status of a run whose outcome no longer changes, or UNFINISHED.
 
     No input may change any more. A run stays free if its amplitudes cannot add up to a contact while they decay. It
-    stays in backward whirl if it has rolled for several turns, with the friction force below its limit by a margin and
-    no larger than in the turn before.
+    stays in backward whirl if it has rolled for several turns, with the friction force below its limit by a margin
+    in the last.
     """
     run, y, c = int(own[_RUN, i]), _Y * LANES + i, _C * LANES + i
     schedule = batch[2]
@@ -830,9 +830,7 @@ def _outcome_is_certain(m, own, i, batch):
         reach += 2.0 * (abs(m[y + X_IH * LANES]) + abs(m[y + Y_IH * LANES]))
         return STAYS_FREE if reach < m[c + FREE_RADIUS * LANES] else UNFINISHED
     if own[_PHASE, i] == ROLLING and own[_TURNS, i] >= _WHIRL_TURNS:
-        share = own[_LAST_SHARE, i]
-        if share < _WHIRL_MARGIN:
-            return STAYS_WHIRLING
+        return STAYS_WHIRLING if own[_LAST_SHARE, i] < _WHIRL_MARGIN else UNFINISHED
     return UNFINISHED
 
 

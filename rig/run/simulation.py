@@ -39,7 +39,7 @@ from rig.run.commands.table import check_command
 from rig.run.fault_injection import FaultInjector
 from rig.run.motion import BRANCH_ALARM, Motion, MotionStart, MotionWatch, energy_balance, initial_state
 from rig.run.scenes import Scene, load_scene, scene_document
-from rig.run.speed_target import Segment, segments
+from rig.run.speed_target import Segment, ramp, segments
 
 TICK_RATE_HZ = 1_000_000
 
@@ -401,11 +401,8 @@ class Simulation:
 
     def ramp_to(self, speed_hz: float) -> None:
         """Ramp the drive to a speed at its ramp rate."""
-        now, target = self._speed(), 2.0 * math.pi * speed_hz
-        length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
-        hold = Segment(tick=self.tick + length, speed=target, slope=0.0)
-        slope = (target - now) / length * TICK_RATE_HZ if length else 0.0
-        self._segments = [Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
+        rate = self.model.parameters["drive.ramp_rate"]
+        self._segments = ramp(self.tick, self._speed(), speed_hz, rate, TICK_RATE_HZ)
 
     def release_magnets(self) -> None:
         """Switch the magnets off."""

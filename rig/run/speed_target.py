@@ -51,3 +51,11 @@ def segments(profile: Sequence[tuple[float, float]], tick_rate_hz: int) -> list[
     points = [(round(time_s * tick_rate_hz), 2.0 * math.pi * hz) for time_s, hz in profile]
     pieces = [Segment(t0, w0, (w1 - w0) / (t1 - t0) * tick_rate_hz) for (t0, w0), (t1, w1) in pairwise(points)]
     return [*pieces, Segment(points[-1][0], points[-1][1], 0.0)]
+
+
+def ramp(tick: int, now: float, speed_hz: float, rate: float, tick_rate_hz: int) -> list[Segment]:
+    """Return the segments from a tick on: a ramp from the target `now` [rad/s] at a rate [rad/s^2], then the speed."""
+    target = 2.0 * math.pi * speed_hz
+    length = round(abs(target - now) / rate * tick_rate_hz)
+    hold = Segment(tick=tick + length, speed=target, slope=0.0)
+    return [Segment(tick=tick, speed=now, slope=(target - now) / length * tick_rate_hz), hold] if length else [hold]

@@ -49,7 +49,7 @@ BUDGETS = {
     "rig/cli": 5769,
     "rig/ensemble": 2019,
     "rig/physics": 5488,
-    "rig/run": 1893,
+    "rig/run": 1895,
     "rig/serve": 3019,
 }
 _NO_CODE = (
