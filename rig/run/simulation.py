@@ -290,14 +290,17 @@ class Simulation:
             self._warm = True
 
     def health(self) -> dict[str, Any]:
-        """Return spin, energy ledger and warnings at the current tick, for the status."""
+        """Return spin, energy ledger, warnings and remarks at the current tick, for the status.
+
+        Warnings are reasons to doubt the run; remarks tell what the model met, as the contact law at zero force.
+        """
         if self.scene.generator is not None:
             return calibrator.health(self.scene)
         first = self.first_row
         last = first if self._last is None else self._last
         balance = energy_balance(last[None, :], first)
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
-        memory, warnings = self._motion.memory, list[str]()
+        memory, warnings, remarks = self._motion.memory, list[str](), list[str]()
         share = min(float(memory[ROLLED_S]) * TICK_RATE_HZ / max(self.tick - self._start, 1), 1.0)
         choice = {**self.scene.engine.model_dump(), "step_us": self._step_ticks, "rolling_share": share}
         accuracy = self._accuracy.copy_completed()
@@ -311,7 +314,7 @@ class Simulation:
                 text += "; after contacts, a wrong branch is suspected"
             warnings.append(text)
         if memory[CLAMPS]:
-            warnings.append(f"the contact law would have pulled at {memory[CLAMPS]:.0f} steps and was held at 0")
+            remarks.append(f"the contact law would have pulled at {memory[CLAMPS]:.0f} steps and was held at 0")
         late_commands = sum(tick >= self.end_tick for tick, _ in self.pending)
         if late_commands:
             warnings.append(f"{late_commands} commands of the scene lie after its end and will not be executed")
@@ -320,7 +323,7 @@ class Simulation:
                 f"{memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least size"
             )
         if memory[FLOORED]:
-            warnings.append(f"{memory[FLOORED]:.0f} contacts began slower than contact.speed_floor")
+            remarks.append(f"{memory[FLOORED]:.0f} contacts began slower than contact.speed_floor")
         return {
             "spin_hz": float(last[COLUMN["theta_rate"]]) / (2.0 * math.pi),
             "energy": {
@@ -336,6 +339,7 @@ class Simulation:
             "peak_normal_force_n": float(memory[PEAK_FORCE]),
             "steps": int(memory[STEPS]),
             "warnings": warnings,
+            "remarks": remarks,
         }
 
     def snapshot(self) -> Snapshot:

@@ -141,6 +141,7 @@ class ServedRun(ABC):
                 "engine": health.get("engine", {}),
                 "accuracy": health.get("accuracy"),
                 "warnings": warnings + self._handler.warnings(),
+                "remarks": health.get("remarks", []),
                 "samples_published": self.published,
                 "commands": self._accepted,
             }

@@ -103,7 +103,11 @@ def test_status_of_a_scene(shifts: dict[str, float], grows: float, status: str, 
     [
         (0.0, {}, []),
         (0.5, {}, ["wrong", "silent"]),
-        (0.5, {"warnings": ["the contact law would have pulled at 3 steps and was held at 0"]}, ["wrong", "silent"]),
+        (
+            0.5,
+            {"warnings": ["2 commands of the scene lie after its end"]},
+            ["wrong", "silent"],
+        ),
         (0.5, {"warnings": [DOUBT]}, ["wrong"]),
         (1e-4, {"warnings": [DOUBT]}, ["false_alarms"]),
         (0.05, {"warnings": [DOUBT]}, []),

@@ -60,6 +60,8 @@ def simulate(
     )
     for warning in health["warnings"]:
         echo(f"warning: {warning}", err=True)
+    for remark in health.get("remarks", []):
+        echo(f"note: {remark}", err=True)
     if check:
         with reporting(compiles=True) as reporter:
             reporter.show_activity("reference run")

@@ -154,6 +154,7 @@ def status_table(document: dict[str, Any]) -> Table:
     for name, client in document["clients"].items():
         text = f"lag {client['lag_s']:.3f} s, last message {client['last_heard_s']:.1f} s ago, lost {client['lost']}"
         rows.append((f"client {name}", text))
+    rows += [("note", text) for text in document.get("remarks", [])]
     for text in document["warnings"]:
         rows.append(("warning", text))
     return fact_table(f"rig: {document['scene']}, {document['state']}", rows, warning="yellow")
