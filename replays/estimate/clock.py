@@ -9,6 +9,18 @@ import numpy as np
 
 from replays.estimate.intervals import student
 
+_STEP_TOLERANCE = 0.2
+"""Relative difference of steps of time stamps that count as equal."""
+_REGULAR_PART, _MAX_ROUNDED = 0.9, 1.1
+"""Part of equal steps above which stamps are not rounded to a coarse resolution, and largest deviation of such stamps
+from a line, peak to peak, over their largest step."""
+_MAX_SCATTER, _MIN_GAP = 5.0, 3.0
+"""The same over the usual step for stamps of which some go back by jitter, and steps over the usual one from which rows
+are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak and steps of 2.5."""
+
+_MAX_CLOCK_STEPS, _MAX_STEP_PART = 4, 1e-3
+"""Number of steps, or part of them, up to which they are steps of the clock or pauses, of any length."""
+
 
 class Line(NamedTuple):
     """A straight line y = offset + slope (x - centre) by least squares.
@@ -72,3 +84,58 @@ def time_error(slope: np.ndarray, residual: np.ndarray) -> float:
     """
     information = float(np.sum(slope**2))
     return float(np.sum(slope * residual)) / information if information > 0.0 else 0.0
+
+
+def find_rate(times_s: np.ndarray, max_hz: float) -> float | None:
+    """Return the rate of time stamps by those of their steps that are equal [Hz]; None if they are a minority.
+
+    None also if the stamps do not ascend on the whole, or faster than a rate can be. Steps of the clock and missing
+    rows do not change the rate.
+
+    Args:
+        times_s: The stamps [s], shape (n,).
+        max_hz: Highest rate [Hz].
+    """
+    if len(times_s) < 2:
+        return None
+    steps = np.diff(times_s)
+    usual, resolution_s = float(np.median(steps)), find_resolution(steps)
+    large = np.abs(steps) > _MIN_GAP * max(usual, resolution_s)
+    alike = steps[np.abs(steps - usual) < _STEP_TOLERANCE * usual]
+    if usual >= 0.0 and len(alike) < _REGULAR_PART * len(steps):
+        # Steps are multiples of a coarse resolution, or have jitter: a line shows the rate.
+        most_s = _MAX_ROUNDED * steps.max() if steps.min() >= 0.0 else _MAX_SCATTER * usual
+        gaps, counts = (usual > 0.0) & (steps > _MIN_GAP * usual), np.ones(len(steps))
+        late = missing = _fit_rows(times_s, counts)
+        period_s = usual
+        for _ in range(2 if gaps.any() else 0):
+            counts[gaps] = np.rint(steps[gaps] / period_s)
+            missing = _fit_rows(times_s, counts)
+            period_s = max(missing[1], 1.0 / max_hz)
+        scatter_s, period_s = min(late, missing)  # a large step is due to late stamps, or to missing rows
+        few = 0 < np.count_nonzero(large) <= max(_MAX_CLOCK_STEPS, _MAX_STEP_PART * len(steps))
+        if few and not scatter_s <= _MAX_SCATTER * max(usual, resolution_s):
+            return find_rate(max(np.split(times_s, np.flatnonzero(large) + 1), key=len), max_hz)
+        if 0.0 < scatter_s <= most_s and period_s * max_hz >= 1.0:
+            return 1.0 / period_s
+    alike_s, span_s = float(alike.sum()), max(0.0, float(times_s[-1] - times_s[0]))
+    if len(steps) - len(alike) <= max(_MAX_CLOCK_STEPS, _MAX_STEP_PART * len(steps)):
+        span_s = alike_s
+    return None if 2.0 * alike_s <= span_s or len(alike) > max_hz * alike_s else len(alike) / alike_s
+
+
+def find_resolution(steps_s: np.ndarray) -> float:
+    """Return the median of those steps of time stamps that ascend [s]; 0 if none does."""
+    return float(np.median(steps_s[steps_s > 0.0])) if np.any(steps_s > 0.0) else 0.0
+
+
+def _fit_rows(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
+    """Return the scatter of stamps about a line, peak to peak, and the line's time per row [s].
+
+    Args:
+        times_s: The stamps [s], shape (n,).
+        counts: Rows from each stamp to the next, shape (n - 1,).
+    """
+    rows = np.append(0.0, np.cumsum(counts))
+    line = fit_line(rows, times_s)
+    return float(np.ptp(line.residual)), line.slope

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.estimate.clock import Line, fit_line
+from replays.estimate.clock import Line, find_rate, find_resolution, fit_line
 from replays.estimate.spectra import parabola_top
 from rig.base.errors import InputError, Words
 
@@ -15,6 +16,12 @@ EVENNESS_TOLERANCE = 0.05
 """Tolerance within which time stamps must fit a straight line to count as even [samples]."""
 _MIN_STEP_S = 0.999e-9
 """Smallest mean interval of time stamps [s]: 1 ns, the resolution of the formats, less rounding."""
+_MIN_STEP, _MAX_SCATTER, _STEP_ROWS = 1.5, 12.0, 8
+"""Smallest step of a clock [sample intervals], over the median scatter of the intervals (8 standard deviations), and
+rows on each side that decide whether it persists: rounded stamps are off by up to one interval, late ones recover."""
+_SHOWN_STEPS, _DAY_S = 3, 86_400.0
+_MAX_GAPS, _MAX_ROWS = 4, 1e15
+"""Ratio of rows with and without gaps up to which steps stand for missing rows, and largest number of these."""
 _HALF_TAPS = 48
 """Taps of the interpolation filter on each side, in samples of the slower rate."""
 _CUTOFF, _KAISER_BETA = 0.94, 9.0
@@ -48,6 +55,7 @@ class TimeAxis:
         jitter_s: Residual of the time stamps from their fitted line, rms and maximum [s].
         note: Origin of the axis.
         numbers: Index of each received sample on the even axis if some are missing, int64, shape (received,).
+        steps: Steps of the clock.
     """
 
     first_s: float
@@ -57,6 +65,7 @@ class TimeAxis:
     jitter_s: tuple[float, float] = (0.0, 0.0)
     note: str = ""
     numbers: np.ndarray | None = None
+    steps: tuple[ClockStep, ...] = ()
 
     def place_samples(self, values: np.ndarray) -> np.ndarray:
         """Return received samples on the full axis, nan for missing ones, shape (rows,)."""
@@ -81,8 +90,102 @@ class TimeAxis:
         return replace(self, first_s=offset_s + stretch * self.first_s, rate_hz=self.rate_hz / stretch, times_s=times_s)
 
 
+@dataclass(frozen=True)
+class ClockStep:
+    """Step of the clock of time stamps.
+
+    Attributes:
+        row: Row before the step, from 1.
+        time_s: Its time stamp [s].
+        size_s: Change of the clock in excess of one sample interval [s]; 0 if rows are missing by a right clock.
+        missing: Number of rows that are treated as missing.
+    """
+
+    row: int
+    time_s: float
+    size_s: float
+    missing: int
+
+
+def remove_steps(times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[ClockStep]]:
+    """Return time stamps without steps of their clock, the rows from each to the next, and the steps.
+
+    A step is a change that persists: a late stamp is none. A step forward stands for missing rows, unless these would
+    be more than the limit; other steps for one missing row, and midnight of a time of day for none.
+
+    Args:
+        times_s: Time stamps [s], shape (n,).
+
+    Returns:
+        Time stamps [s], shape (n,), rows, int64, shape (n - 1,), and the steps in order.
+    """
+    steps, rows = np.diff(times_s), len(times_s)
+    counts, period_s = np.ones(rows - 1, dtype=np.int64), 0.0
+    if (rate := find_rate(times_s, 1.0 / _MIN_STEP_S)) is not None:
+        period_s = 1.0 / rate
+    excess = steps - period_s
+    noise_s = _MAX_SCATTER * float(np.median(np.abs(excess)))
+    least_s = max(_MIN_STEP * max(period_s, find_resolution(steps)), noise_s)
+    odd = np.flatnonzero(np.abs(excess) > least_s) if period_s else np.empty(0, dtype=np.int64)
+    if not len(odd):
+        return times_s, counts, []
+    if noise_s < EVENNESS_TOLERANCE * period_s:  # single rows may be missing too
+        counts = np.clip(np.rint(steps / period_s), 1, _MAX_ROWS).astype(np.int64)
+        counts[odd] = 1
+    numbers = np.append(0, np.cumsum(counts))
+    late_s = times_s - times_s[0] - period_s * numbers
+
+    def persists(at: int) -> bool:
+        before = late_s[max(0, at + 1 - _STEP_ROWS) : at + 1]
+        after = late_s[at + 1 : at + 1 + _STEP_ROWS]
+        return bool(abs(np.median(after) - np.median(before) - excess[at]) < 0.5 * abs(excess[at]))
+
+    odd = odd[[persists(at) for at in odd.tolist()]]
+    slack_s = max(EVENNESS_TOLERANCE * period_s, noise_s)
+    part = np.searchsorted(odd, np.arange(rows), side="left")  # rows between steps have one line each
+    first_s = times_s[np.append(0, odd + 1)]
+    period_s = _fit_parts(numbers, times_s - first_s[part], part)
+    counts[odd] = np.maximum(2, np.rint(np.minimum(steps[odd] / period_s, _MAX_ROWS)))
+    order = odd[np.argsort(-counts[odd])]
+    surplus = rows + int(np.sum(counts - 1)) - _MAX_GAPS * rows
+    counts[order[: int(np.sum(np.cumsum(counts[order] - 2) - counts[order] + 2 < surplus))]] = 2
+    counts[odd[np.abs(excess[odd] + _DAY_S) < slack_s]] = 1
+    numbers = np.append(0, np.cumsum(counts))
+    level_s = first_s + np.bincount(part, times_s - first_s[part] - period_s * numbers) / np.bincount(part)
+    moved = np.diff(level_s)
+    moved[np.abs(moved) < slack_s] = 0.0
+    mended = times_s - np.append(0.0, np.cumsum(moved))[part]
+    if np.ptp(fit_line(numbers, mended).residual) > 0.5 * np.ptp(fit_line(np.arange(rows), times_s).residual):
+        return times_s, np.ones_like(counts), []  # late stamps that recover
+    return (
+        mended,
+        counts,
+        [
+            ClockStep(at + 1, float(times_s[at]), float(excess[at]) if size else 0.0, int(counts[at]) - 1)
+            for at, size in zip(odd.tolist(), moved.tolist(), strict=True)
+        ],
+    )
+
+
+def _fit_parts(numbers: np.ndarray, times_s: np.ndarray, part: np.ndarray) -> float:
+    """Return the common time per row of several parts with a line each [s]."""
+    sizes = np.bincount(part)
+    x, y = (each - (np.bincount(part, each) / sizes)[part] for each in (numbers, times_s))
+    return float(x @ y) / float(x @ x)
+
+
+def describe_steps(steps: Sequence[ClockStep]) -> str:
+    """Return the place and size of clock steps as text; empty if there are none."""
+    texts = []
+    for one in steps[:_SHOWN_STEPS]:
+        step = f"the clock steps by {one.size_s:+.6g} s: " if one.size_s else ""
+        gap = f"{step}{one.missing} {'row' if one.missing == 1 else 'rows'} missing" if one.missing else "midnight"
+        texts.append(f"{gap} after row {one.row}, at {one.time_s:.9g} s")
+    return "; ".join([*texts, *([f"{len(steps) - len(texts)} more"] if len(steps) > len(texts) else [])])
+
+
 def make_axis(times_s: np.ndarray, *, line: bool, what: str) -> TimeAxis:
-    """Return the time axis of time stamps.
+    """Return the time axis of time stamps, with gaps for the steps of their clock.
 
     Args:
         times_s: Time stamps [s], shape (n,).
@@ -95,14 +198,16 @@ def make_axis(times_s: np.ndarray, *, line: bool, what: str) -> TimeAxis:
     n = len(times_s)
     if n < 2 or not np.isfinite(times_s).all():
         raise InputError("time stamps", "two or more finite numbers", Words(f"{what} with {n}"))
-    steps = np.diff(times_s)
+    times_s, counts, found = remove_steps(times_s)
+    steps, note = np.diff(times_s), "straight line through the time stamps"
     if not np.all(steps > 0.0) and not line:
         at = int(np.argmax(steps <= 0.0)) + 1
         must = 'ascending (or set time.stamps = "line" or time.rate_hz)'
         raise InputError(
             "time stamps", must, Words(f"{what}, {times_s[at]:g} s after {times_s[at - 1]:g} s (row {at + 1})")
         )
-    whole = fit_line(np.arange(n), times_s)
+    numbers = np.concatenate([[0], np.cumsum(counts)])
+    whole = fit_line(numbers, times_s)
     step, jitter = whole.slope, _jitter(whole)
     if not step >= _MIN_STEP_S:
         must = "ascending by 1 ns or more on average (or set time.rate_hz)"
@@ -110,15 +215,18 @@ def make_axis(times_s: np.ndarray, *, line: bool, what: str) -> TimeAxis:
     even = line or jitter[1] < EVENNESS_TOLERANCE * step
     if not even:
         # Samples may be missing from an even axis, for example when a network dropped them.
-        numbers = np.concatenate([[0], np.cumsum(np.rint(steps / np.median(steps)))]).astype(np.int64)
-        if np.all(np.diff(numbers) > 0) and n <= numbers[-1] < 4 * n:
-            kept = fit_line(numbers, times_s)
+        places = np.concatenate([[0], np.cumsum(np.rint(steps / np.median(steps)))]).astype(np.int64)
+        if np.all(np.diff(places) > 0) and n <= places[-1] < _MAX_GAPS * n:
+            kept = fit_line(places, times_s)
             if (spread := _jitter(kept))[1] < EVENNESS_TOLERANCE * kept.slope:
-                rows = int(numbers[-1]) + 1
-                note = f"straight line through the time stamps, {rows - n} samples missing"
-                return TimeAxis(kept.at_zero, 1.0 / kept.slope, rows, None, spread, note, numbers)
-        return TimeAxis(float(times_s[0]), 1.0 / step, n, times_s, jitter, "time stamps as they are")
-    return TimeAxis(whole.at_zero, 1.0 / step, n, None, jitter, "straight line through the time stamps")
+                whole, numbers, jitter, even = kept, places, spread, True
+    if not even:
+        note = "time stamps as they are"
+        return TimeAxis(float(times_s[0]), 1.0 / step, n, times_s, jitter, note, steps=tuple(found))
+    if (rows := int(numbers[-1]) + 1) == n:
+        return TimeAxis(whole.at_zero, 1.0 / whole.slope, n, None, jitter, note, steps=tuple(found))
+    note += f", {rows - n} samples missing"
+    return TimeAxis(whole.at_zero, 1.0 / whole.slope, rows, None, jitter, note, numbers, tuple(found))
 
 
 def _jitter(line: Line) -> tuple[float, float]:

@@ -133,7 +133,11 @@ class Log:
             first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
             return clock.TimeAxis(first_s, time.rate_hz, rows, note="rate from the mapping")
         if signal.times_s is not None:
-            return clock.make_axis(signal.times_s, line=time.stamps == "line", what=what)
+            axis = clock.make_axis(signal.times_s, line=time.stamps == "line", what=what)
+            name = what.rpartition(" in ")[2]
+            if axis.steps and (remark := f"{name}: {clock.describe_steps(axis.steps)}") not in self.remarks:
+                self.remarks.append(remark)
+            return axis
         if signal.rate_hz is not None:
             return clock.TimeAxis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
         raise InputError("time.rate_hz", f"set, as the file has no rate for {what}", None)

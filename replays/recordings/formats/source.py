@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from replays.estimate.clock import find_rate
 from rig.base.checks import DOCUMENT_BYTES, describe_error, load_extensions, read_json
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.files import build_read_error, open_file, read_file
@@ -351,13 +352,14 @@ def read_error(path: Path, what: str, error: BaseException | str) -> InputError:
     return InputError("file", f"an intact {what} file", Words(f"{path} ({text})"[:300]))
 
 
-def even_rate_hz(times_s: np.ndarray, rows: int | None = None) -> float | None:
-    """Return the mean rate of time stamps [Hz]; None if they do not ascend, or the rate exceeds the limit.
+def even_rate_hz(times_s: np.ndarray) -> float | None:
+    """Return the rate of time stamps [Hz]; None if they do not ascend, or the rate exceeds the limit.
 
     Args:
-        times_s: The stamps, or the first and last of them [s], shape (n,).
-        rows: Number of rows, if not all stamps are given.
+        times_s: The stamps, or the first ones [s], shape (n,).
     """
+    if (rate_hz := find_rate(times_s, MAX_RATE_HZ)) is not None:
+        return rate_hz
     span = float(times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
-    steps = (rows or len(times_s)) - 1
+    steps = len(times_s) - 1
     return steps / span if span > 0.0 and steps <= MAX_RATE_HZ * span else None

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from recorder.reader import Recording
-from replays.estimate.clock import fit_line
+from replays.estimate.clock import find_rate
 from replays.recordings.formats.mapping import ChannelMapping, FileOptions
 from replays.recordings.formats.source import MAX_RATE_HZ, Entry, FileSignal, Source, even_rate_hz, open_source
 from replays.score.records.rows import take_rows
@@ -29,12 +29,8 @@ _MAX_VALUE = 1e30
 """Largest value of a measurement, in any unit."""
 _STEP_TOLERANCE = 0.2
 """Relative difference of steps of time stamps that count as equal."""
-_REGULAR_PART, _MAX_ROUNDED = 0.9, 1.1
-"""Part of equal steps above which stamps are not rounded to a coarse resolution, and largest deviation of such stamps
-from a line, peak to peak, over their largest step."""
-_MAX_SCATTER, _MIN_GAP = 5.0, 3.0
-"""The same over the usual step for stamps of which some go back by jitter, and steps over the usual one from which rows
-are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak and steps of 2.5."""
+_REGULAR_PART = 0.9
+"""Part of rows that a lower, even rate must explain."""
 Pieces = Callable[[Sequence[int]], Iterable[np.ndarray]]
 
 
@@ -108,27 +104,7 @@ class RecordedTable:
 
         None also if the stamps do not ascend on the whole, or faster than a rate can be.
         """
-        times_s = self.early[:, 0]
-        if not self.stamped or len(times_s) < 2:
-            return None
-        steps = np.diff(times_s)
-        usual = float(np.median(steps))
-        alike = steps[np.abs(steps - usual) < _STEP_TOLERANCE * usual]
-        if usual >= 0.0 and len(alike) < _REGULAR_PART * len(steps):
-            # Steps are multiples of a coarse resolution, or have jitter: a line shows the rate.
-            most_s = _MAX_ROUNDED * steps.max() if steps.min() >= 0.0 else _MAX_SCATTER * usual
-            gaps, counts = (usual > 0.0) & (steps > _MIN_GAP * usual), np.ones(len(steps))
-            late = missing = _fit_line(times_s, counts)
-            period_s = usual
-            for _ in range(2 if gaps.any() else 0):
-                counts[gaps] = np.rint(steps[gaps] / period_s)
-                missing = _fit_line(times_s, counts)
-                period_s = max(missing[1], 1.0 / MAX_RATE_HZ)
-            scatter_s, period_s = min(late, missing)  # a large step is due to late stamps, or to missing rows
-            if 0.0 < scatter_s <= most_s and period_s * MAX_RATE_HZ >= 1.0:
-                return 1.0 / period_s
-        alike_s, span_s = float(alike.sum()), max(0.0, float(times_s[-1] - times_s[0]))
-        return None if 2.0 * alike_s <= span_s or len(alike) > MAX_RATE_HZ * alike_s else len(alike) / alike_s
+        return find_rate(self.early[:, 0], MAX_RATE_HZ) if self.stamped else None
 
 
 @dataclass(frozen=True)
@@ -286,18 +262,6 @@ def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded
                 signal = replace(signal, table=tables[key], stated_hz=(signal.rate_hz or rate_hz) / step)
         separated.append(signal)
     return separated
-
-
-def _fit_line(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
-    """Return the scatter of stamps about a line, peak to peak, and the line's time per row [s].
-
-    Args:
-        times_s: The stamps [s], shape (n,).
-        counts: Rows from each stamp to the next, shape (n - 1,).
-    """
-    rows = np.append(0.0, np.cumsum(counts))
-    line = fit_line(rows, times_s)
-    return float(np.ptp(line.residual)), line.slope
 
 
 def _ends_with_line_end(path: Path) -> bool:

@@ -44,7 +44,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     stamps = None if layout.empty_first else time_column(names, options.time_column, path=path)
     if stamps is None and options.time_column is None and not layout.empty_first:
         stamps = _find_datetime_column(path, layout, options)
-    start, base, rows, ends_s = layout.start, 0, 0, []
+    start, base, rows, rate = layout.start, 0, 0, layout.rate_hz
     unit, scale = "", 1.0
     first = _first_fields(path, layout)
     stamps, date = (None, None) if options.time_column == "none" else _date_and_time(layout, first, stamps)
@@ -61,12 +61,11 @@ def look_into(path: Path, options: FileOptions) -> Source:
             if np.isnan(part_s).any():
                 line = layout.first + rows + int(np.argmax(np.isnan(part_s))) + 1
                 raise InputError("file.time_column", "a column without missing values", Words(f"{path}, line {line}"))
-            ends_s = [*(ends_s or part_s)[:1], part_s[-1]]
+            rate = rate if rows else even_rate_hz(part_s)
         rows += len(part[0])
         kept = None if kept is None or rows * len(names) > _MAX_CACHED_VALUES else [*kept, part]
     if not rows:
         raise InputError("file", "a text file with lines of numbers", str(path))
-    rate = layout.rate_hz if stamps is None else even_rate_hz(np.array(ends_s), rows)
     kept_names = [(c, name) for c, name in enumerate(names) if c not in (stamps, date)]
     entries = tuple(Entry(name, "", layout.units[c], rows, rate, c) for c, name in kept_names)
 

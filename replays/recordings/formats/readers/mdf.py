@@ -39,6 +39,8 @@ _SYNC_NONE, _SYNC_TIME = 0, 1
 """Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
 _PIECE = 1 << 22
 """Bytes of records read at a time."""
+_EARLY_ROWS = 1 << 16
+"""Records whose stamps give the rate of a group."""
 _SCAN_BYTES, _MAX_BLOCK_BYTES = 1 << 20, 1 << 28
 """Bytes that are searched for blocks at a time, and most bytes of a block that are measured."""
 _HEAD, _FLAGS = 64, 4
@@ -178,8 +180,8 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
             continue
         name = str(getattr(group.channel_group, "acq_name", "") or f"group {number}")
         scale = _time_unit_s(mdf, number)
-        ends = [mdf.get_master(number, record_offset=at, record_count=1) for at in (0, rows - 1)]
-        rate = None if scale is None else even_rate_hz(np.concatenate(ends) * scale, rows)
+        early = mdf.get_master(number, record_offset=0, record_count=min(rows, _EARLY_ROWS))
+        rate = None if scale is None else even_rate_hz(np.asarray(early, dtype=float) * scale)
         master = mdf.masters_db.get(number)
         for index, channel in enumerate(group.channels):
             if index == master:
