@@ -72,6 +72,7 @@ COMMANDS = {
     },
     "Compare recordings with the model": {
         "validate": "Simulate a recording again and compare it with the model",
+        "compare": "Show what changed between two recordings, by phase and channel",
         "identify": "Fit parameters of the rig to a recording",
         "score": "Score a DAQ by comparing its recording with what the rig sent",
         "campaign": "Run scripted tests of a device in the loop",
@@ -112,9 +113,9 @@ GROUPS = {
 
 
 NEED_FULL = (
-    "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
-    "score", "plot", "campaign", "sessions", "simulate", "sweep", "map", "bench", "ladder", "chart", "stability",
-    "paper",
+    "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "compare",
+    "identify", "score", "plot", "campaign", "sessions", "simulate", "sweep", "map", "bench", "ladder", "chart",
+    "stability", "paper",
 )  # fmt: skip
 """Commands that a lean install lacks; of `keys` it has the subcommands."""
 

@@ -55,9 +55,9 @@ def test_commands_of_the_full_install_explain_how_to_get_it() -> None:
 
 
 FULL_ARGUMENTS = {
-    "score": "{rec} --against {rec}",
+    "score": "{rec} --against {rec}", "compare": "{rec} {rec}",
     "import": "{rec} --template x.toml", "validate": "{rec}", "identify": "{rec} --fit contact.friction",
-"view": "{rec}", "sessions": "-o {folder}", "campaign": "hammer", "run": "hammer",
+    "view": "{rec}", "sessions": "-o {folder}", "campaign": "hammer", "run": "hammer",
     "simulate": "hammer -o {folder}/x.mcap", "sweep": "x.toml -o {folder}/x", "map": "x.toml -o {folder}/x",
     "plot": "{rec} -o {folder}/plots",
     "can": "hub c0", "ladder": "hammer -q whirl_frequency -t 0.1", "paper": "-o {folder}/x.html",

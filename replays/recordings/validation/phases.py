@@ -85,8 +85,8 @@ class Reading:
     phases: tuple[str, ...] = PHASES
 
 
-_FORCES = ("P_N", "P_S", "P_E", "P_W")
-_RING = ("ring_x", "ring_y")
+FORCES = ("P_N", "P_S", "P_E", "P_W")
+RING = ("ring_x", "ring_y")
 _DISK = ("disk_x", "disk_y")
 
 
@@ -113,22 +113,22 @@ def _orbit(view: View) -> float:
 
 
 QUANTITIES = {
-    "whirl_frequency": Reading("Hz", "phase slope of the shaft in the ring; negative is backward", _RING, _whirl,
+    "whirl_frequency": Reading("Hz", "phase slope of the shaft in the ring; negative is backward", RING, _whirl,
                                 ("whirl",)),
-    "sense": Reading("", "1 forward, -1 backward", _RING, lambda view: math.copysign(1.0, _whirl(view)), ("whirl",)),
-    "radius": Reading("mm", "mean radius in the ring", _RING, lambda view: float(view.radius().mean()),
+    "sense": Reading("", "1 forward, -1 backward", RING, lambda view: math.copysign(1.0, _whirl(view)), ("whirl",)),
+    "radius": Reading("mm", "mean radius in the ring", RING, lambda view: float(view.radius().mean()),
                        ("whirl", "rest")),
-    "contact_fraction": Reading("", "share of samples in contact", _RING,
+    "contact_fraction": Reading("", "share of samples in contact", RING,
                                  lambda view: float(view.contact().mean()), ("impacts", "whirl", "rest")),
-    "impacts": Reading("", "number of contacts", _RING, _impacts, ("impacts",)),
-    "mean_force": Reading("N", "mean size of the reaction, both axes", _FORCES,
+    "impacts": Reading("", "number of contacts", RING, _impacts, ("impacts",)),
+    "mean_force": Reading("N", "mean size of the reaction, both axes", FORCES,
                            lambda view: float(np.abs(view.force()).mean()), ("impacts", "whirl", "rest")),
-    "peak_force": Reading("N", "largest reaction", _FORCES, lambda view: float(np.abs(view.force()).max()),
+    "peak_force": Reading("N", "largest reaction", FORCES, lambda view: float(np.abs(view.force()).max()),
                            ("impacts", "whirl", "rest")),
-    "impulse": Reading("N s", "size of the reaction over time", _FORCES, _impulse, ("impacts",)),
-    "ripple_x": Reading("N", "sqrt(2) RMS of P_E - P_W about its mean", _FORCES, _ripple("P_E", "P_W"),
+    "impulse": Reading("N s", "size of the reaction over time", FORCES, _impulse, ("impacts",)),
+    "ripple_x": Reading("N", "sqrt(2) RMS of P_E - P_W about its mean", FORCES, _ripple("P_E", "P_W"),
                          ("impacts", "whirl")),
-    "ripple_y": Reading("N", "sqrt(2) RMS of P_N - P_S about its mean", _FORCES, _ripple("P_N", "P_S"),
+    "ripple_y": Reading("N", "sqrt(2) RMS of P_N - P_S about its mean", FORCES, _ripple("P_N", "P_S"),
                          ("impacts", "whirl")),
     "orbit": Reading("mm", "RMS of the disk's orbit about its mean", _DISK, _orbit),
     "mean_x": Reading("mm", "mean of the disk, horizontal", _DISK, lambda view: float(view.values["disk_x"].mean()),
@@ -139,14 +139,14 @@ QUANTITIES = {
     "spin_lowest": Reading("Hz", "lowest of the tachometer, means over 5 ms", ("speed",),
                             lambda view: _lowest(view), ("impacts",)),
     # Computed from two views: see `spectrum_distance`.
-    "spectrum_ring": Reading("", "distance of the full spectra of the shaft in the ring", _RING, lambda _: 0.0),
+    "spectrum_ring": Reading("", "distance of the full spectra of the shaft in the ring", RING, lambda _: 0.0),
     "spectrum_disk": Reading("", "distance of the full spectra of the disk", _DISK, lambda _: 0.0),
-    "spectrum_force": Reading("", "distance of the full spectra of the reaction", _FORCES, lambda _: 0.0),
+    "spectrum_force": Reading("", "distance of the full spectra of the reaction", FORCES, lambda _: 0.0),
     # From the truth, if recorded.
     "dissipated": Reading("J", "dissipated within the phase (truth)", (), lambda _: math.nan),
     "drive_work": Reading("J", "work of the drive within the phase (truth)", (), lambda _: math.nan),
 }  # fmt: skip
-SPECTRA = {"spectrum_ring": _RING, "spectrum_disk": _DISK, "spectrum_force": _FORCES}
+SPECTRA = {"spectrum_ring": RING, "spectrum_disk": _DISK, "spectrum_force": FORCES}
 
 
 def _lowest(view: View) -> float:
@@ -198,7 +198,7 @@ def quantities(view: View, phase: str) -> dict[str, float]:
     values = {}
     for name, quantity in QUANTITIES.items():
         if phase in quantity.phases and quantity.needs and name not in SPECTRA and view.has(*quantity.needs):
-            if quantity.needs == _RING and not math.isfinite(view.touches) and name in ("contact_fraction", "impacts"):
+            if quantity.needs == RING and not math.isfinite(view.touches) and name in ("contact_fraction", "impacts"):
                 continue
             values[name] = quantity.read(view)
     return values
@@ -216,7 +216,7 @@ def spectra(a: View, b: View, floors: dict[str, float]) -> dict[str, float]:
     for name, channels in SPECTRA.items():
         if a.has(*channels) and b.has(*channels) and len(a.values[channels[0]]) >= 64:
             pair = [
-                view.force() if channels == _FORCES else view.values[channels[0]] + 1j * view.values[channels[1]]
+                view.force() if channels == FORCES else view.values[channels[0]] + 1j * view.values[channels[1]]
                 for view in (a, b)
             ]
             # For a constant signal only the spectra of the noise would be compared.
@@ -235,10 +235,10 @@ def find_phases(view: View, *, floor_n: float) -> list[Phase]:
         view: The whole recording.
         floor_n: Noise of the reaction [N].
     """
-    if view.has(*_RING) and math.isfinite(view.touches):
+    if view.has(*RING) and math.isfinite(view.touches):
         times, contact = view.times_s["ring_x"], view.contact()
         angle = phase_of(view.values["ring_x"], view.values["ring_y"]) / (2.0 * math.pi)
-    elif view.has(*_FORCES):
+    elif view.has(*FORCES):
         times, contact = view.times_s["P_E"], np.abs(view.force()) > _CONTACT_FLOORS * floor_n
         angle = np.zeros(len(times))
     else:

@@ -29,7 +29,7 @@ _MIN_SEGMENTS = 32
 """Minimum number of segments for an estimate of the corner."""
 
 
-def _spectra(values: np.ndarray) -> np.ndarray:
+def segment_spectra(values: np.ndarray) -> np.ndarray:
     """Return the power spectrum of each segment [unit^2], shape (segments, lines from _FIRST_LINE).
 
     It is computed from second differences, corrected for their gain, which removes slow motion. White noise has its
@@ -47,7 +47,7 @@ def _spectra(values: np.ndarray) -> np.ndarray:
 
 def _floor(values: np.ndarray, quiet: float) -> tuple[np.ndarray, int]:
     """Return the noise power in each line from _LOW, shape (lines,), and the number of segments."""
-    spectra = _spectra(values)
+    spectra = segment_spectra(values)
     rows = len(spectra)
     if not rows:
         return np.empty(0), 0
