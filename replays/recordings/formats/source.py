@@ -103,7 +103,8 @@ MAX_RATE_HZ = 1e9
 """Highest sample rate [Hz], given by time stamps in ns."""
 _MIN_RATE_HZ = 1e-6
 """Lowest sample rate [Hz]: a value in eleven days."""
-_MAX_TIME_S = 1e12
+_MAX_TIME_S, _MAX_VALUE = 1e12, 1e30
+"""Largest time stamp [s], and largest value in any unit; instruments write 9.9e37 for an overload."""
 
 
 @dataclass(frozen=True)
@@ -155,8 +156,10 @@ class FileSignal:
 
     @property
     def physical(self) -> np.ndarray:
-        """Values in the file's unit, float64, shape (n,)."""
+        """Values in the file's unit, nan for those that no measurement has, float64, shape (n,)."""
         values = self.values.astype(float)
+        if self.values.dtype.kind == "f":
+            values[~(np.abs(values) <= _MAX_VALUE)] = np.nan
         if (self.scale, self.offset) != (1.0, 0.0):
             values = values * self.scale + self.offset
         return values

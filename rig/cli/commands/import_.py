@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -75,17 +77,37 @@ def import_(
     _guess(files or [], template, output, picture, force=force, form=form)
 
 
-def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool, form: Form) -> None:
-    """Import by a mapping, given as a file or as the text of a guess."""
+def _import(
+    files: list[Path],
+    mapping: Path | str,
+    output: Path,
+    *,
+    left_out: Mapping[str, InputError] = MappingProxyType({}),
+    force: bool,
+    form: Form,
+) -> None:
+    """Import by a mapping, given as a file or as the text of a guess, without some of its channels."""
     from recorder.files.unfinished_file import check_destination
     from replays.recordings.formats.conversion import convert, write_recording
-    from replays.recordings.formats.mapping import Mapping, load_mapping, parse_mapping
+    from replays.recordings.formats.mapping import Mapping as MappingFile
+    from replays.recordings.formats.mapping import load_mapping, parse_mapping
     from rig.cli.output.progress import reporting
 
     check_destination(output, force=force)
     check_output_differs(files if isinstance(mapping, str) else [*files, mapping], output)
     name = "the guess (--template writes it)" if isinstance(mapping, str) else mapping.name
-    checked = parse_mapping(tomllib.loads(mapping), name=name) if isinstance(mapping, str) else load_mapping(mapping)
+    if isinstance(mapping, str):
+        data = tomllib.loads(mapping)
+        data["channels"] = {key: each for key, each in data.get("channels", {}).items() if key not in left_out}
+        if "hammer" in left_out:
+            data.pop("hammer", None)
+            if data.get("experiment", {}).get("commands") == "detected":
+                data.pop("experiment")
+        if left_out and not data["channels"]:
+            raise next(iter(left_out.values()))
+        checked = parse_mapping(data, name=name)
+    else:
+        checked = load_mapping(mapping)
     with reporting() as reporter:
         try:
             doubts = (
@@ -93,10 +115,11 @@ def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool
                 if isinstance(mapping, str)
                 else []
             )
+            doubts += [f"left out: {error}" for error in left_out.values()]
             conversion = convert(files, checked, doubts=doubts, say=reporter.step)
         except InputError as error:
             # An error in a log file is not an error in the mapping, whose table [file] has other fields.
-            if error.field == "file" or error.field.split(".")[0] not in Mapping.model_fields:
+            if error.field == "file" or error.field.split(".")[0] not in MappingFile.model_fields:
                 raise
             raise InputError(f"{name}: {error.field}", error.must, error.received) from None
 
@@ -141,10 +164,22 @@ def _guess(
         )
         echo(f"{path}: {description}")
     if output is not None:
-        for guess in guesses:
-            if "unit" in guess.asks and guess.entry.unit:
-                units.parse(guess.entry.unit, field=f"unit of {guess.entry.name} (--template FILE.toml asks for it)")
-        _import(files, text, output, force=force, form=form)
+        _import(files, text, output, left_out=_find_left_out(guesses), force=force, form=form)
+
+
+def _find_left_out(guesses: list[Guess]) -> dict[str, InputError]:
+    """Return the signals that cannot be imported by a guess, with the reason, by the name of the channel."""
+    left_out = {}
+    for guess in guesses:
+        name, unit = guess.entry.name, guess.entry.unit
+        try:
+            if guess.features.missing == len(guess.features.values):
+                raise InputError(name, "a signal with valid values", Words("none"))
+            if "unit" in guess.asks and unit:
+                units.parse(unit, field=f"unit of {name} (--template FILE.toml asks for it)")
+        except InputError as error:
+            left_out[guess.channel or name] = error
+    return left_out
 
 
 def _find_questions(text: str) -> list[str]:

@@ -85,7 +85,9 @@ def look_into(path: Path, options: FileOptions) -> Source:
             yield [FileSignal(values=values, times_s=part_s) for values in arrays]
 
     kept = {key.decode(): text.decode(errors="replace") for key, text in about.items() if key != b"ARROW:schema"}
-    return Source(path, "Parquet", tuple(entries), read, pieces, about=kept, start=start)
+    texts = [name for c, (name, _) in enumerate(headings) if c != stamps and not _numeric(schema.field(c).type)]
+    remarks = (f"non-numeric columns left out: {', '.join(texts)}",) if texts else ()
+    return Source(path, "Parquet", tuple(entries), read, pieces, about=kept, start=start, remarks=remarks)
 
 
 def _numeric(kind: Any) -> bool:

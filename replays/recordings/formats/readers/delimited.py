@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Collection, Iterator, Sequence
-from datetime import datetime
+from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.recordings.formats.readers import columnar
-from replays.recordings.formats.readers.dialect import MISSING, Layout, find_layout, instant, time_column
+from replays.recordings.formats.readers.dialect import (
+    MISSING,
+    Layout,
+    find_layout,
+    has_ambiguous_date,
+    instant,
+    join_segments,
+    time_column,
+)
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, read_error
 from replays.recordings.resimulation.background import Background
 from rig.base.errors import InputError, Words
@@ -23,6 +33,13 @@ _BLOCK_BYTES = 1 << 21
 """Bytes parsed at a time."""
 _LAST_BYTES = 1 << 16
 """Bytes at the end of a file in which its last line is searched."""
+_ISO = re.compile(r"\d{4}-\d\d-\d\d([ T]\d\d:\d\d(:\d\d(\.\d{1,9})?)?(Z|[-+]\d\d:?\d\d)?)?$")
+"""Dates and times that pyarrow can read."""
+_NANOSECONDS = re.compile(r"[.,:]\d{6}(\d{1,3})(?!\d)")
+_NO_NUMBER, _MAX_MARKS = re.compile(r"column #(\d+): .* invalid value '([^'\d]+)'"), 32
+"""Error of pyarrow on a text without digits in a column of numbers, and most such texts in a file."""
+_EPOCH_MS = 1e11
+"""Times in s reach this number in the year 5138, times in ms since 1970 in 1973."""
 _BLANKS = [" " * n for n in range(1, 33)]
 """Blank fields, as in fixed-width columns."""
 _MAX_CACHED_VALUES = 1 << 24
@@ -42,31 +59,47 @@ def look_into(path: Path, options: FileOptions) -> Source:
     layout = find_layout(path, options)
     names = list(layout.names)
     stamps = None if layout.empty_first else time_column(names, options.time_column, path=path)
-    if stamps is None and options.time_column is None and not layout.empty_first:
+    if layout.stamps is not None:
+        stamps = None
+    elif stamps is None and options.time_column is None and not layout.empty_first:
         stamps = _find_datetime_column(path, layout, options)
     start, base, rows, rate = layout.start, 0, 0, layout.rate_hz
-    unit, scale = "", 1.0
+    unit, scale, epoch = "", 1.0, ()
     first = _first_fields(path, layout)
     stamps, date = (None, None) if options.time_column == "none" else _date_and_time(layout, first, stamps)
     if stamps is not None and layout.dialect.is_number(first[stamps]) and not options.time_format:
         missing = first[stamps] in ("", *MISSING, *options.missing)
         number = "nan" if missing else layout.dialect.normalise(first[stamps]).replace(layout.dialect.decimal, ".")
         unit, scale = options.time_in_s(names[stamps], layout.units[stamps], float(number))
+        if float(number) >= _EPOCH_MS:
+            epoch = (f"numbers of {names[stamps]} read as {unit} since 1970",)
     kept: list[list[Any]] | None = []
-    for part in _parse_columns(path, layout, options, stamps, date):
-        if stamps is not None:
-            if not rows:
-                start, base = start or columnar.first_instant(part[stamps]), columnar.base_ns(part[stamps])
-            part_s = columnar.numbers(part[stamps], base) * scale
-            if np.isnan(part_s).any():
-                line = layout.first + rows + int(np.argmax(np.isnan(part_s))) + 1
-                raise InputError("file.time_column", "a column without missing values", Words(f"{path}, line {line}"))
-            rate = rate if rows else even_rate_hz(part_s)
-        rows += len(part[0])
-        kept = None if kept is None or rows * len(names) > _MAX_CACHED_VALUES else [*kept, part]
+    marks: dict[str, str] = {}
+    while True:
+        try:
+            for part in _parse_columns(path, layout, options, stamps, date):
+                if stamps is not None:
+                    if not rows:
+                        start, base = start or columnar.first_instant(part[stamps]), columnar.base_ns(part[stamps])
+                    part_s = columnar.numbers(part[stamps], base) * scale
+                    if np.isnan(part_s).any():
+                        line = layout.first + rows + int(np.argmax(np.isnan(part_s))) + 1
+                        must = "a column without missing values"
+                        raise InputError("file.time_column", must, Words(f"{path}, line {line}"))
+                    rate = rate if rows else even_rate_hz(part_s)
+                rows += len(part[0])
+                kept = None if kept is None or rows * len(names) > _MAX_CACHED_VALUES else [*kept, part]
+            break
+        except InputError as error:
+            text, name = _find_mark(error, layout, (stamps, date))
+            if len(marks) == _MAX_MARKS:
+                raise
+            marks[text], rows, kept = name, 0, []
+            options = options.model_copy(update={"missing": (*options.missing, text)})
     if not rows:
         raise InputError("file", "a text file with lines of numbers", str(path))
-    kept_names = [(c, name) for c, name in enumerate(names) if c not in (stamps, date)]
+    others = {stamps, date, *layout.texts, *(layout.stamps or ())}
+    kept_names = [(c, name) for c, name in enumerate(names) if c not in others]
     entries = tuple(Entry(name, "", layout.units[c], rows, rate, c) for c, name in kept_names)
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
@@ -87,9 +120,28 @@ def look_into(path: Path, options: FileOptions) -> Source:
         return None if stamps is None else columns()[stamps] * scale
 
     def read(entry: Entry) -> FileSignal:
+        if layout.stamps is not None:
+            own_s = columns()[layout.stamps[entry.place]]
+            return signal(columns()[entry.place][np.isfinite(own_s)], own_s[np.isfinite(own_s)])
         return signal(columns()[entry.place], times_s())
 
-    dialect, remarks = layout.dialect, layout.remarks
+    if layout.stamps is not None:
+        own = [read(entry).times_s for entry in entries]
+        entries = tuple(
+            replace(entry, rows=len(times), rate_hz=even_rate_hz(times))
+            for entry, times in zip(entries, own, strict=True)
+            if times is not None
+        )
+    dialect, remarks = layout.dialect, (*layout.remarks, *epoch)
+    if marks:
+        texts = ", ".join(f"{text!r} ({name})" for text, name in marks.items())
+        remarks += (f"texts read as missing values: {texts}",)
+    if left_out := [names[c] for c in layout.texts if c not in (stamps, date)]:
+        remarks += (f"columns of text left out: {', '.join(left_out)}",)
+    if not options.time_format and (
+        dates := [first[c] for c in (stamps, date) if c is not None and has_ambiguous_date(first[c])]
+    ):
+        remarks += (f"dates such as {dates[0]} read as month/day/year (set file.time_format to override)",)
     last = dialect.fields(_last_line(path, layout.encoding))
     if not layout.ragged and len(last) < layout.width:
         remarks += (f"{Source.CUT_LAST_LINE}: {len(last)} of {layout.width} columns",)
@@ -100,7 +152,21 @@ def look_into(path: Path, options: FileOptions) -> Source:
         dialect_options["time_column"] = names[stamps] or stamps + 1
     if unit not in ("", "s"):
         dialect_options["time_unit"] = unit
-    return Source(path, "text", entries, read, pieces, start=start, remarks=remarks, options=dialect_options)
+    whole = pieces if layout.stamps is None else None
+    return Source(path, "text", entries, read, whole, start=start, remarks=remarks, options=dialect_options)
+
+
+def _find_mark(error: InputError, layout: Layout, stamps: Sequence[int | None]) -> tuple[str, str]:
+    """Return the text that is no number and stopped the parser, and the name of its column.
+
+    Raises:
+        InputError: Another error, a text in a column of times, or one with digits, which may be a damaged number.
+    """
+    match = _NO_NUMBER.search(str(error.received))
+    number = int(match[1]) - layout.empty_first if match else None
+    if match is None or number is None or number in stamps:
+        raise error
+    return match[2], layout.names[number]
 
 
 def _first_fields(path: Path, layout: Layout) -> list[str]:
@@ -117,10 +183,14 @@ def _find_datetime_column(path: Path, layout: Layout, options: FileOptions) -> i
 
 
 def _date_and_time(layout: Layout, first: Sequence[str], stamps: int | None) -> tuple[int | None, int | None]:
-    """Return the time column, and the column of its dates (ISO 8601) if it has times of day, else None."""
-    texts = list(enumerate(first[: len(layout.names)]))
-    times = [c for c, text in texts if isinstance(instant(text, None), float)]
-    dates = [c for c, text in texts if isinstance(instant(text, "%Y-%m-%d"), datetime)]
+    """Return the time column, and the column of its dates if it has times of day, else None."""
+    found = [
+        (c, instant(text, None))
+        for c, text in enumerate(first[: len(layout.names)])
+        if not layout.dialect.is_number(text)
+    ]
+    times = [c for c, moment in found if isinstance(moment, float)]
+    dates = [c for c, moment in found if isinstance(moment, datetime) and ":" not in first[c]]
     if not times or not dates or stamps not in (None, *times, *dates):
         return stamps, None
     return (stamps if stamps in times else times[0]), dates[0]
@@ -146,11 +216,13 @@ def _parse_columns(
         return "skip"
 
     kinds: dict[str, Any] = dict.fromkeys(kept, pyarrow.float64())
+    kinds |= {kept[c]: pyarrow.string() for c in layout.texts}
+    first = _first_fields(path, layout)
     source, skipped, encoding = _body(path, layout)
     if stamps is not None and options.time_unit in (None, "datetime"):
-        kinds[kept[stamps]] = _time_kind(_first_fields(path, layout)[stamps], layout, options)
+        kinds[kept[stamps]] = _time_kind(first[stamps], layout, options)
     if date is not None:
-        kinds[kept[date]] = pyarrow.timestamp("ns")
+        kinds[kept[date]] = _time_kind(first[date], layout, options)
     try:
         reader = csv.open_csv(
             source,
@@ -167,8 +239,12 @@ def _parse_columns(
         )  # fmt: skip
         for batch in reader:
             columns = batch.columns
-            if stamps is not None and pyarrow.types.is_string(columns[stamps].type):
-                columns[stamps] = _instants(path, columns[stamps], options)
+            for c in (stamps, date):
+                if c is not None and pyarrow.types.is_string(columns[c].type):
+                    columns[c] = _instants(path, columns[c], options)
+            for c in layout.texts:
+                if c not in (stamps, date):
+                    columns[c] = pyarrow.nulls(len(batch), pyarrow.float64())
             if stamps is not None and date is not None:
                 columns[stamps] = columnar.join_instants(columns[date], columns[stamps])
                 columns[date] = pyarrow.nulls(len(batch), pyarrow.float64())
@@ -199,10 +275,9 @@ def _body(path: Path, layout: Layout) -> tuple[Any, int, str]:
     if not (dialect.delimiter == " " or dialect.thousands or layout.encoding == "utf-16" or layout.ragged):
         return str(path), layout.first, layout.encoding.replace("-sig", "")
     mended = []
-    for line in path.read_text(encoding=layout.encoding).splitlines()[layout.first :]:
-        fields = [dialect.normalise(text) if dialect.is_number(text) else text for text in dialect.fields(line)]
-        if layout.ragged and not any(fields[layout.width :]):
-            fields = (fields + [""] * layout.width)[: layout.width] if any(fields) else fields
+    lines = path.read_text(encoding=layout.encoding).splitlines()[layout.first :]
+    for fields in join_segments(lines, layout) if layout.ragged else map(dialect.fields, lines):
+        fields = [dialect.normalise(text) if dialect.is_number(text) else text for text in fields]
         mended.append(dialect.delimiter.join(fields))
     return io.BytesIO("\n".join(mended).encode()), 0, "utf8"
 
@@ -217,7 +292,7 @@ def _time_kind(text: str, layout: Layout, options: FileOptions) -> Any:
     if parsed is None:
         must = "set for times that are not numbers (such as %d.%m.%Y %H:%M:%S)"
         raise InputError("file.time_format", must if options.time_format is None else "that of the times", text)
-    if options.time_format is not None or "," in text or not isinstance(parsed, datetime):
+    if options.time_format is not None or not _ISO.match(text) or not isinstance(parsed, datetime):
         return pyarrow.string()
     return pyarrow.timestamp("ns", tz=None if parsed.tzinfo is None else "UTC")
 
@@ -227,16 +302,22 @@ def _instants(path: Path, column: Any, options: FileOptions) -> Any:
     import pyarrow
 
     moments: list[Any] = []
+    zoned = False
     for text in column.to_pylist():
         moment = instant(str(text), options.time_format)
         if moment is None:
             raise InputError("file.time_format", f"that of the times in {path.name}", str(text))
-        moments.append(moment)
-    kind = pyarrow.float64()
-    if isinstance(moments[0], datetime):
-        zoned = getattr(moments[0], "tzinfo", None) is not None
-        kind = pyarrow.timestamp("us", tz="UTC" if zoned else None)
-    return pyarrow.array(moments, kind)
+        if not isinstance(moment, datetime):
+            moments.append(moment)
+            continue
+        zoned = zoned or moment.tzinfo is not None
+        utc = moment.astimezone(UTC).replace(tzinfo=None) if moment.tzinfo else moment
+        finer = _NANOSECONDS.search(str(text))  # a datetime has microseconds only
+        moments.append(np.datetime64(utc, "ns") + np.timedelta64(int(finer[1].ljust(3, "0")) if finer else 0, "ns"))
+    instants = isinstance(moments[0], np.datetime64)
+    return pyarrow.array(
+        np.array(moments), pyarrow.timestamp("ns", tz="UTC" if zoned else None) if instants else pyarrow.float64()
+    )
 
 
 def _quoted(name: str) -> str:

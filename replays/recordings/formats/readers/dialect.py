@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,15 +17,38 @@ from rig.base.files import open_file
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
 
-_HEAD_LINES = 200
+_HEAD_LINES, _COMPARED_LINES = 2000, 100
+"""Lines among which the first line of data is searched, and lines of data that determine the layout."""
 _DELIMITERS = {"tab": "\t", "comma": ",", "semicolon": ";", "space": " "}
-MISSING = ["", "nan", "NaN", "NAN", "n/a", "NA", "null", "--", "---", "-", "#N/A", "1.#QNAN", "-1.#IND", "Overload"]
-"""Texts for a missing value."""
+_MARKS = (
+    "nan", "n/a", "na", "null", "none", "nil", "inf", "-inf", "--", "---", "-", "*", "**", "***", "?", "over", "ovl",
+    "ovr", "ol", "overload", "overflow", "overrange", "under", "underrange", "error", "err", "fault", "bad", "invalid",
+    "missing", "open", "#n/a", "#na", "#num!", "#div/0!", "#value!", "#ref!", "#null!", "1.#inf", "-1.#inf", "1.#qnan",
+    "-1.#qnan", "1.#ind", "-1.#ind", "1.#snan", "1.#inf00", "-1.#inf00", "1.#qnan0", "-1.#ind00",
+)  # fmt: skip
+MISSING = ["", "NaN", *dict.fromkeys(form(text) for text in _MARKS for form in (str, str.upper, str.capitalize))]
+"""Texts for a missing or invalid value."""
 _LVM = "LabVIEW Measurement"
 _LVM_END = "***End_of_Header***"
 _HEADING = re.compile(r"\s*(.*?)\s*[\[(]([^\])]*)[\])]\s*")
-_TIMES = re.compile(r"(time|zeit|timestamp|timestamps|t|x_value|seconds|datetime|date.?time)([ _].*)?", re.IGNORECASE)
-_TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d+)?)")
+_TIMES = re.compile(
+    r"[\W_]*((elapsed|abs|absolute|rel|relative|local|utc|gps|log|daq|system|sample|sampling|record|meas|test)[ ._-]*)?"
+    r"(times?|zeit|uhrzeit|zeitstempel|timestamps?|time[ _-]stamps?|temps|tiempo|tempo|czas|tijd"
+    r"|t|x_value|seconds|secs?|datetime|date.?time)([ _].*|\W*)",
+    re.IGNORECASE,
+)
+_DAY = (
+    r"(?P<y>\d{4})[-/.](?P<m>\d{1,2})[-/.](?P<d>\d{1,2})"
+    r"|(?P<a>\d{1,2})(?P<s>[-/. ])(?P<b>\d{1,2}|[A-Za-zä]{3,9})\.?[-/. ](?P<z>\d{4}|\d\d)"
+)
+_TIME_OF_DAY = (
+    r"(?P<hour>\d{1,2}):(?P<minute>\d\d):(?P<second>\d\d)"
+    r"(?:[.,:](?P<part>\d+))?\s*(?:(?P<pm>[AP])\.?M\.?)?"
+)
+_MOMENT = re.compile(rf"(?:{_DAY})?(?:^|$|[T,]? *)(?:{_TIME_OF_DAY})?", re.IGNORECASE)
+_MAX_DAY_S, _MONTHS_OF_A_YEAR, _MIN_TEXT_LINES = 90_000.0, 12, 4
+"""Largest time of day [s], and fewest lines of data by which columns of text are recognised."""
+_MONTHS = ("jan", "feb", "mar mär", "apr", "may mai", "jun", "jul", "aug", "sep", "oct okt", "nov", "dec dez")
 
 
 @dataclass(frozen=True)
@@ -80,8 +103,12 @@ class Layout:
     """Fields of a line of data, possibly with an empty one at either end."""
     empty_first: bool = False
     """True if the first field of every line is empty, where LabVIEW omits its time column."""
+    texts: tuple[int, ...] = ()
+    """Columns of text among the names."""
     ragged: bool = False
     """True if lines may have additional fields, empty ones or a comment."""
+    stamps: tuple[int, ...] | None = None
+    """Column of the times of each column, where LabVIEW writes several; else None."""
     rate_hz: float | None = None
     first_s: float = 0.0
     start: datetime | None = None
@@ -129,7 +156,7 @@ def find_layout(path: Path, options: FileOptions) -> Layout:
     text, encoding, remarks = _head(path, options.encoding)
     lines = text.splitlines()
     if lines and lines[0].startswith(_LVM):
-        return _lvm_layout(path, text.split("\n"), encoding)
+        return _lvm_layout(path, path.read_text(encoding=encoding).split("\n"), encoding, options)
     layouts = [layout for dialect in _dialects(options) if (layout := _layout(lines, dialect, encoding, options))]
     if not layouts:
         grouped = [Dialect(*marks) for marks in (
@@ -137,6 +164,10 @@ def find_layout(path: Path, options: FileOptions) -> Layout:
             ("\t", ".", ","), (";", ".", "'"), (";", ",", "'"),
         )] if options.thousands is None else []  # fmt: skip
         layouts = [layout for dialect in grouped if (layout := _layout(lines, dialect, encoding, options))]
+    if not layouts:
+        layouts = [
+            found for each in _dialects(options) if (found := _layout(lines, each, encoding, options, texts=True))
+        ]
     if not layouts:
         must = "a text file with lines of numbers (set file.delimiter, decimal, thousands, time_format)"
         raise InputError("file", must, str(path))
@@ -148,7 +179,7 @@ def find_layout(path: Path, options: FileOptions) -> Layout:
         grouping = f", thousands {dialect.thousands!r}" if dialect.thousands else ""
         line = layout.first + 1
         remarks += (f"read with delimiter {shown}, decimal {dialect.decimal!r}{grouping}, first line of data {line}",)
-    return Layout(encoding, dialect, layout.names, layout.units, layout.first, layout.width, remarks=remarks)
+    return replace(layout, remarks=remarks)
 
 
 def _dialects(options: FileOptions) -> list[Dialect]:
@@ -162,13 +193,16 @@ def _dialects(options: FileOptions) -> list[Dialect]:
     return [Dialect(*pair, thousands) for pair in pairs if pair[0] != pair[1] != thousands]
 
 
-def _layout(lines: list[str], dialect: Dialect, encoding: str, options: FileOptions) -> tuple[bool, Layout] | None:
+def _layout(
+    lines: list[str], dialect: Dialect, encoding: str, options: FileOptions, *, texts: bool = False
+) -> tuple[bool, Layout] | None:
     """Return the layout for a dialect, and whether its columns have names; None if the dialect does not fit."""
-    first = _data_start(lines, dialect, options)
+    first = (_text_data_start if texts else _data_start)(lines, dialect, options)
     if first is None:
         return None
     width = len(dialect.fields(lines[first]))
-    data = [fields for line in lines[first:] if line.strip() and len(fields := dialect.fields(line)) == width]
+    part = lines[first : first + _COMPARED_LINES]
+    data = [fields for line in part if line.strip() and len(fields := dialect.fields(line)) == width]
     # A delimiter at the end of every line does not make a column, unless that has a name.
     open_end = width > 1 and dialect.delimiter != " " and all(not fields[-1] for fields in data)
     names, names_at = _names(lines, first, dialect, width, options, open_end=open_end)
@@ -176,7 +210,8 @@ def _layout(lines: list[str], dialect: Dialect, encoding: str, options: FileOpti
     headings = [parse_heading(name) for name in names]
     both = tuple(unit or row for (_, unit), row in zip(headings, unit_row, strict=True))
     plain = tuple(name for name, _ in headings)
-    return names_at is not None, Layout(encoding, dialect, plain, both, first, width)
+    words = _find_texts(data, len(plain), dialect, options)
+    return names_at is not None, Layout(encoding, dialect, plain, both, first, width, texts=words)
 
 
 def _head(path: Path, encoding: str | None) -> tuple[str, str, tuple[str, ...]]:
@@ -202,17 +237,75 @@ def instant(text: str, time_format: str | None) -> datetime | float | None:
 
     Args:
         text: The text.
-        time_format: Format for strptime; None: ISO 8601, or hours:minutes:seconds.
+        time_format: Format for strptime; None: ISO 8601, or a date and a time of day in a common order. Numbers with
+            slashes are month/day/year, unless the first one is above 12.
     """
     try:
         if time_format is not None:  # strptime accepts at most six digits of a second
             return datetime.strptime(re.sub(r"([.,]\d{6})\d+", r"\1", text), time_format)
-        day = _TIME_OF_DAY.fullmatch(text)
-        if day:
-            return 3600.0 * int(day[1]) + 60.0 * int(day[2]) + float(day[3].replace(",", "."))
-        return datetime.fromisoformat(text.replace(",", "."))
-    except ValueError:
+        match = _MOMENT.fullmatch(text.strip())
+        if match is None or not (match["hour"] or match["y"] or match["z"]):
+            return datetime.fromisoformat(text.replace(",", "."))
+        seconds = 0.0
+        if match["hour"]:
+            hour = int(match["hour"]) % 12 + 12 * (match["pm"] in "Pp") if match["pm"] else int(match["hour"])
+            seconds = 3600.0 * hour + 60.0 * int(match["minute"]) + int(match["second"])
+        part = match["part"] or "0"
+        if not (match["y"] or match["z"]):
+            return seconds + float(f"0.{part}") if seconds < _MAX_DAY_S else None
+        return datetime(*_day(match)) + timedelta(seconds=seconds, microseconds=int(part.ljust(6, "0")[:6]))
+    except (ValueError, StopIteration):
         return None
+
+
+def _day(match: re.Match[str]) -> tuple[int, int, int]:
+    """Return year, month and day of a matched date."""
+    if match["y"]:
+        return int(match["y"]), int(match["m"]), int(match["d"])
+    year, first, second = int(match["z"]) + 2000 * (len(match["z"]) == 2), int(match["a"]), match["b"].lower()
+    if second.isalpha():
+        return year, next(n for n, names in enumerate(_MONTHS, 1) if second[:3] in names.split()), first
+    day_first = match["s"] == "." or first > _MONTHS_OF_A_YEAR
+    return (year, int(second), first) if day_first else (year, first, int(second))
+
+
+def has_ambiguous_date(text: str) -> bool:
+    """Return whether month and day of a date could be either way round."""
+    match = _MOMENT.fullmatch(text.strip())
+    if match is None or not match["z"] or match["s"] == "." or match["pm"] or not match["b"].isdigit():
+        return False
+    return match["a"] != match["b"] and max(int(match["a"]), int(match["b"])) <= _MONTHS_OF_A_YEAR
+
+
+def _kind(text: str, dialect: Dialect, options: FileOptions) -> str:
+    """Return the kind of a field: number, instant or text; empty for a missing value."""
+    if not text or text in MISSING or text in options.missing:
+        return ""
+    return "number" if dialect.is_number(text) else "text" if instant(text, options.time_format) is None else "instant"
+
+
+def _find_texts(rows: Sequence[Sequence[str]], columns: int, dialect: Dialect, options: FileOptions) -> tuple[int, ...]:
+    """Return the columns in which most values are texts."""
+    kinds = [[_kind(row[c], dialect, options) for row in rows] for c in range(columns)]
+    return tuple(c for c, each in enumerate(kinds) if 2 * each.count("text") > sum(map(bool, each)))
+
+
+def _text_data_start(lines: list[str], dialect: Dialect, options: FileOptions) -> int | None:
+    """Return the first line of the longest sequence of lines with columns of one kind each, some of them numbers."""
+    if options.first_line is not None:
+        return _data_start(lines, dialect, options)
+    best, start, kinds, size = (0, 0), None, list[str](), 0
+    for n, line in enumerate(lines):
+        if not line.strip():
+            continue
+        fields = [_kind(text, dialect, options) for text in dialect.fields(line)]
+        same = len(fields) == len(kinds) and all(not a or not b or a == b for a, b in zip(kinds, fields, strict=True))
+        if start is None or not same:
+            start, kinds, size = n, fields, 0
+        kinds, size = [a or b for a, b in zip(kinds, fields, strict=True)], size + 1
+        if "number" in kinds and len(kinds) > 1:
+            best = max(best, (size, -start))
+    return -best[1] if best[0] >= _MIN_TEXT_LINES else None
 
 
 def _data_start(lines: list[str], dialect: Dialect, options: FileOptions) -> int | None:
@@ -229,9 +322,8 @@ def _data_start(lines: list[str], dialect: Dialect, options: FileOptions) -> int
         return len(fields) if good and None not in moments else 0
 
     filled = [n for n, line in enumerate(lines) if line.strip()]
-    widths = [width(lines[n]) for n in filled]
-    for at, (n, size) in enumerate(zip(filled, widths, strict=True)):
-        if size and all(other == size for other in widths[at : at + 3]):
+    for at, n in enumerate(filled):
+        if (size := width(lines[n])) and all(width(lines[other]) == size for other in filled[at + 1 : at + 3]):
             return n
     return None
 
@@ -286,42 +378,88 @@ def _units(
     return (fields + [""] * columns)[:columns]
 
 
-def _lvm_layout(path: Path, lines: list[str], encoding: str) -> Layout:
+def _lvm_head(lines: Sequence[str], tab: str) -> tuple[dict[str, list[str]], float | None, datetime | None]:
+    """Return the header of a segment of a LabVIEW file, the first time of its rows [s], and its start."""
+    head = {key: [value.strip() for value in values] for key, *values in (line.split(tab) for line in lines)}
+    date, clock = (next(iter(head.get(key, [])), "") for key in ("Date", "Time"))
+    start = instant(f"{date} {clock}", None)
+    return head, _lvm_number(head, "X0"), start if isinstance(start, datetime) else None
+
+
+def _lvm_number(head: dict[str, list[str]], key: str) -> float | None:
+    try:
+        return float(next(text for text in head.get(key, []) if text).replace(",", "."))
+    except (StopIteration, ValueError):
+        return None
+
+
+def join_segments(lines: Sequence[str], layout: Layout) -> list[list[str]]:
+    """Return the fields of a LabVIEW file's rows without the headers of later segments, with times if there are any.
+
+    Args:
+        lines: Lines from the first row on.
+        layout: Layout of the first segment.
+    """
+    tab, decimal, width = layout.dialect.delimiter, layout.dialect.decimal, layout.width
+    rows, late_s, number, step = list[list[str]](), 0.0, 0, 1.0 / layout.rate_hz if layout.rate_hz else 0.0
+    first_s, restarts, in_head, head_lines = layout.first_s, False, False, list[str]()
+    for line in lines:
+        if line.startswith(_LVM_END):
+            head, x0, start = _lvm_head(head_lines, tab)
+            step, first_s, number, restarts = _lvm_number(head, "Delta_X") or step, x0 or 0.0, -1, True
+            if start is not None and layout.start is not None:
+                late_s = (start - layout.start).total_seconds()
+            in_head = False
+        elif in_head or line.startswith("Channels" + tab):
+            in_head, head_lines = True, [*(head_lines if in_head else []), line]
+        elif number < 0:  # the names of the columns
+            number = 0
+        elif line.strip():
+            fields = (layout.dialect.fields(line) + [""] * width)[:width]
+            if layout.rate_hz and not layout.empty_first:
+                fields[0] = repr(late_s + first_s + number * step).replace(".", decimal)
+            elif restarts and late_s:
+                for c in {*(layout.stamps or (0,))}:
+                    own_s = fields[c].replace(decimal, ".")
+                    fields[c] = repr(late_s + float(own_s)).replace(".", decimal) if own_s else ""
+            rows.append(fields)
+            number += 1
+    return rows
+
+
+def _lvm_layout(path: Path, lines: list[str], encoding: str, options: FileOptions) -> Layout:
     """Return the layout of a LabVIEW measurement file from its header (National Instruments' specification of .lvm)."""
-    head: dict[str, list[str]] = {}
+    lines = [line.rstrip("\r") for line in lines]
     ends = [n for n, line in enumerate(lines) if line.startswith(_LVM_END)]
-    tab = next((line.rstrip("\r").split("Separator")[1][:1] for line in lines if line.startswith("Separator")), "\t")
-    for line in lines[: ends[-1]] if ends else []:
-        key, *values = line.rstrip("\r").split(tab)
-        head[key] = [value.strip() for value in values]
     if len(ends) < 2:
         raise InputError("file", "a LabVIEW measurement file with a header of its data", str(path))
+    tab = next((line.split("Separator")[1][:1] for line in lines if line.startswith("Separator")), "\t")
+    head, first_s, start = _lvm_head(lines[: ends[1]], tab)
     decimal = (head.get("Decimal_Separator") or ["."])[0] or "."
     mode = (head.get("X_Columns") or ["No"])[0].lower()
-    if mode not in ("no", "one"):
-        raise InputError("file", "a .lvm file with at most one time column", Words(f"{path} (X_Columns {mode})"))
-
-    def number(key: str) -> float | None:
-        try:
-            return float(next(text for text in head.get(key, []) if text).replace(decimal, "."))
-        except (StopIteration, ValueError):
-            return None
-
-    first = ends[1] + 2
-    names = [name.strip() for name in lines[first - 1].rstrip("\r").split(tab)]
-    width = len(lines[first].rstrip("\r").split(tab))
-    names = tuple(names[:width])
-    unit_row = (["", *head.get("Y_Unit_Label", [])] + [""] * width)[:width]
-    step = number("Delta_X")
-    empty = mode == "no"
-    date, clock = (next(iter(head.get(key, [])), "") for key in ("Date", "Time"))
-    start = None
-    match = re.match(r"(\d+)/(\d+)/(\d+) (\d+):(\d+):(\d+)(?:[.,](\d{1,6}))?", f"{date} {clock}")
-    if match:
-        parts = [int(part) for part in match.groups()[:6]]
-        start = datetime(*parts[:6], int((match[7] or "0").ljust(6, "0")))  # type: ignore[misc]
+    first, step, empty = ends[1] + 2, _lvm_number(head, "Delta_X"), mode == "no"
+    names = [name.strip() for name in "".join(lines[first - 1 : first]).split(tab)]
+    names = names[:-1] if names[-1] == "Comment" else names
+    if not "".join(lines[first:]).strip():
+        raise InputError("file", "a file with rows of values", Words(f"{path}, which has columns but no rows"))
+    width = min(len(names), max(len(line.split(tab)) for line in lines[first : first + _COMPARED_LINES]))
+    names, texts, stamps, at = names[:width], head.get("Y_Unit_Label", []), list[int](), 0
+    for c, name in enumerate(names):
+        at = c if name == "X_Value" else at
+        stamps.append(at)
+    channels = (c for c, at in enumerate(stamps) if c != at)
+    units_by_column = dict(zip(channels, texts, strict=False))
+    unit_row = [units_by_column.get(c, "") for c in range(width)]
+    dialect = Dialect(tab, decimal)
+    early = [(dialect.fields(line) + [""] * width)[:width] for line in lines[first : first + _COMPARED_LINES]]
+    hidden = empty and len(ends) == 2  # with several segments, the empty column receives their times
+    words = [c - hidden for c in _find_texts(early, width, dialect, options) if c not in stamps]
     return Layout(
-        encoding, Dialect(tab, decimal), names[empty:], tuple(unit_row[empty:]), first, width, empty_first=empty,
-        ragged=True, rate_hz=1.0 / step if empty and step else None, first_s=number("X0") or 0.0,
-        start=start, remarks=("LabVIEW measurement file: dialect, units and rate are from its header",),
+        encoding, dialect, tuple(names[hidden:]), tuple(unit_row[hidden:]), first, width, empty_first=hidden,
+        texts=tuple(words), ragged=True, stamps=tuple(stamps) if mode == "multi" else None,
+        rate_hz=1.0 / step if empty and step else None, first_s=first_s or 0.0, start=start,
+        remarks=(
+            "LabVIEW measurement file: dialect, units and rate are from its header",
+            *([f"{len(ends) - 1} segments, each at the time of its header"] if len(ends) > 2 else []),
+        ),
     )  # fmt: skip

@@ -25,7 +25,6 @@ from replays.recordings.formats.source import (
     load_library,
     read_error,
 )
-from rig.base import units
 from rig.base.files import find_data_limit, inflate, open_file
 
 if TYPE_CHECKING:
@@ -71,18 +70,19 @@ def look_into(path: Path, options: FileOptions) -> Source:
     mdf = _open(path)
     with _suppress_output():
         _check_records(mdf, find_data_limit(path.stat().st_size))
-        entries, texts = _entries(mdf)
+        entries, texts = _entries(mdf, options)
 
     def read(entry: Entry) -> FileSignal:
         with _suppress_output():
-            return _signal(mdf, *entry.place)
+            group, index = entry.place
+            return _signal(mdf, group, index, options)
 
     def pieces(signals: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         group = signals[0].group_number
         if not _has_own_stamps(mdf, group):
             yield [read(entry) for entry in signals]
             return
-        second, master = _time_unit_s(mdf, group), mdf.masters_db[group]
+        second, master = _time_unit_s(mdf, group, options), mdf.masters_db[group]
         kinds = [_find_scale(mdf, *entry.place) for entry in signals]
         columns = [(master, None), *zip((entry.place[1] for entry in signals), kinds, strict=True)]
         streams: list[Iterator[Any]] = [
@@ -96,7 +96,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
             times_s = None if second is None else np.asarray(blocks[0][0], dtype=float) * second
             yield [_from_records(part, kind, times_s) for part, kind in zip(blocks[1:], kinds, strict=True)]
 
-    remarks = (f"{texts} non-numeric channels ignored",) if texts else ()
+    remarks = (f"non-numeric channels left out: {', '.join(texts)}",) if texts else ()
     about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
     return Source(
         path, f"MDF {mdf.version}", tuple(entries), read, pieces, start=mdf.header.start_time,
@@ -172,14 +172,14 @@ def _check_records(mdf: Any, data_limit: int) -> None:
                 raise ValueError(f"channel {channel.name} outside its record")
 
 
-def _entries(mdf: Any) -> tuple[list[Entry], int]:
-    entries, texts = [], 0
+def _entries(mdf: Any, options: FileOptions) -> tuple[list[Entry], list[str]]:
+    entries, texts = [], list[str]()
     for number, group in enumerate(mdf.groups):
         rows = int(group.channel_group.cycles_nr)
         if not rows:
             continue
         name = str(getattr(group.channel_group, "acq_name", "") or f"group {number}")
-        scale = _time_unit_s(mdf, number)
+        scale = _time_unit_s(mdf, number, options)
         early = mdf.get_master(number, record_offset=0, record_count=min(rows, _EARLY_ROWS))
         rate = None if scale is None else even_rate_hz(np.asarray(early, dtype=float) * scale)
         master = mdf.masters_db.get(number)
@@ -187,7 +187,7 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
             if index == master:
                 continue
             if not _numeric(mdf, number, index):
-                texts += 1
+                texts.append(str(channel.name))
                 continue
             unit = str(channel.unit or getattr(channel.conversion, "unit", "") or "")
             text = _TEXT.search(str(channel.comment or ""))
@@ -196,7 +196,7 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
     return entries, texts
 
 
-def _time_unit_s(mdf: Any, group: int) -> float | None:
+def _time_unit_s(mdf: Any, group: int, options: FileOptions) -> float | None:
     """Return the unit of a group's master channel [s]; None if it has none, or is an angle, a length or an index.
 
     The format requires seconds; some programs write other units.
@@ -208,7 +208,7 @@ def _time_unit_s(mdf: Any, group: int) -> float | None:
     if getattr(master, "sync_type", _SYNC_TIME) not in (_SYNC_NONE, _SYNC_TIME):
         return None
     unit = str(master.unit or getattr(master.conversion, "unit", "") or "")
-    return units.size_si(unit) if units.get_quantity(unit) == "time" else 1.0
+    return options.time_in_s("", unit, 0.0)[1]
 
 
 def _numeric(mdf: Any, group: int, index: int) -> bool:
@@ -237,8 +237,8 @@ def _find_scale(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
     return (1.0, 0.0) if law is None or kind == _IDENTITY else (float(law.a), float(law.b))
 
 
-def _signal(mdf: Any, group: int, index: int) -> FileSignal:
-    kind, second = _find_scale(mdf, group, index), _time_unit_s(mdf, group)
+def _signal(mdf: Any, group: int, index: int, options: FileOptions) -> FileSignal:
+    kind, second = _find_scale(mdf, group, index), _time_unit_s(mdf, group, options)
     data = mdf.get(group=group, index=index, raw=kind is not None, ignore_invalidation_bits=True)
     times_s = None if second is None else np.asarray(data.timestamps, dtype=float) * second
     return _from_records((data.samples, data.invalidation_bits), kind, times_s)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC
 from pathlib import Path
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.recordings.formats.exporting import export
-from replays.recordings.formats.readers.dialect import is_time
-from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, load_library, read_error
+from replays.recordings.formats.readers.dialect import is_time, parse_heading
+from replays.recordings.formats.source import Entry, FileSignal, Source, load_library, read_error
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.selection import ExportChunk, ExportTable, Selection
@@ -66,11 +66,14 @@ def look_into(path: Path, options: FileOptions) -> Source:
     start = min(starts) if starts else None
     if file.file_status.incomplete_final_segment:
         raise read_error(path, "TDMS", "it is truncated")
-    entries, texts = [], 0
+    entries, texts, stamps = [], list[str](), dict[str, Any]()
     for number, (name, channels) in enumerate(groups):
+        stamps[name] = _time_channel(channels, options)
         for channel in channels:
+            if channel is stamps[name]:
+                continue
             if not len(channel) or (channel.dtype.kind not in "iuf"):
-                texts += bool(len(channel))
+                texts += [channel.name] * bool(len(channel))
                 continue
             unit = str(channel.properties.get("unit_string", channel.properties.get("NI_UnitDescription", "")))
             step = channel.properties.get("wf_increment")
@@ -80,9 +83,10 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
     def read(entry: Entry) -> FileSignal:
         with nptdms.TdmsFile.open(path) as opened:
-            return _signal(opened[entry.place[0]], entry.place[1], start)
+            times = stamps[entry.place[0]]
+            return _signal(opened[entry.place[0]], entry.place[1], start, options, times and times.name)
 
-    remarks = (f"{texts} non-numeric channels ignored",) if texts else ()
+    remarks = (f"non-numeric channels left out: {', '.join(texts)}",) if texts else ()
     about = {key: str(value) for key, value in file.properties.items() if isinstance(value, str | int | float)}
     zero = None if start is None or str(start).startswith("1904") else start.astype("datetime64[us]").item()
     return Source(
@@ -100,7 +104,15 @@ def _label(properties: dict[str, Any]) -> str:
     return "; ".join(filter(None, texts))
 
 
-def _signal(group: Any, name: str, start: Any) -> FileSignal:
+def _time_channel(channels: Sequence[Any], options: FileOptions) -> Any:
+    """Return the channel with the times of a group: the requested one, else one that is named as a time, or None."""
+    if options.time_column is not None:
+        return next((each for each in channels if each.name == options.time_column), None)
+    rates = [each.properties.get("wf_increment") for each in channels]
+    return None if any(rates) else next((each for each in channels if len(each) and is_time(each.name)), None)
+
+
+def _signal(group: Any, name: str, start: Any, options: FileOptions, times_name: str | None) -> FileSignal:
     channel = group[name]
     properties = channel.properties
     scale, offset = 1.0, 0.0
@@ -122,14 +134,17 @@ def _signal(group: Any, name: str, start: Any) -> FileSignal:
         late_s = float((began - start) / np.timedelta64(1, "us")) * 1e-6 if start is not None else 0.0
         first_s = late_s + float(properties.get("wf_start_offset", 0.0))
         return FileSignal(values=values, scale=scale, offset=offset, rate_hz=1.0 / step, first_s=first_s)
-    stamps = next((other for other in group.channels() if is_time(other.name) and other.name != name), None)
-    if stamps is None or len(stamps) != len(values):
+    if times_name is None or len(group[times_name]) != len(values):
         return FileSignal(values=values, scale=scale, offset=offset)
+    stamps = group[times_name]
     times = np.asarray(stamps[:])
     if times.dtype.kind == "M":
         times = (times - (times[0] if start is None else start)) / np.timedelta64(1, "us") * 1e-6
-    times_s = None if even_rate_hz(times) is None else times.astype(float)
-    return FileSignal(values=values, scale=scale, offset=offset, times_s=times_s)
+    else:
+        unit = str(stamps.properties.get("unit_string", stamps.properties.get("NI_UnitDescription", "")))
+        heading, named = parse_heading(times_name)
+        times = times.astype(float) * options.time_in_s(heading, unit or named, float(times[0]))[1]
+    return FileSignal(values=values, scale=scale, offset=offset, times_s=times)
 
 
 class TdmsWriter(export.FormatWriter):
