@@ -1070,3 +1070,13 @@ def test_a_record_without_a_keyphasor_pulse_has_no_edges() -> None:
     sine = np.sin(0.01 * np.arange(len(turn))) + 0.01 * rng.standard_normal(len(turn))
     assert len(edges(bipolar)) > 0
     assert len(edges(sine)) in (31, 32)
+
+
+def test_a_subtracted_offset_is_a_remark(tmp_path: Path) -> None:
+    path = rows_csv(tmp_path / "x.csv", {"time": np.arange(500) / 1000, "P_N [N]": 7.0 + np.arange(500) % 2})
+    for bias, how in (('"mean"', "its mean"), ("7.5", "by the mapping")):
+        mapping = f'[channels.P_N]\nsource = "P_N"\nbias = {bias}\n'
+        conversion, _ = imported(tmp_path, [path], mapping, name=how.split()[-1])
+        assert f"P_N: an offset of 7.5 N was subtracted ({how}, bias)" in conversion.remarks
+    conversion, _ = imported(tmp_path, [path], '[channels.P_N]\nsource = "P_N"\n')
+    assert not any("offset" in remark for remark in conversion.remarks)

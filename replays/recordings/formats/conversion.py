@@ -112,6 +112,10 @@ def convert(
     for entry in signals:
         _check_corner(entry, mapping, remarks)
         convert_to_engineering(entry, mapping)
+        if entry.bias:
+            how = "its mean" if entry.mapping.bias == "mean" else "by the mapping"
+            unit = entry.mapping.unit or entry.entry.unit
+            remarks.append(f"{entry.name}: an offset of {entry.bias:.6g} {unit} was subtracted ({how}, bias)")
     pulses, low_s, high_s = _range(signals, log)
     say("placing samples")
     groups, zero_s = place_groups(signals, mapping, low_s, high_s)
