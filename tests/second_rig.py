@@ -2,7 +2,7 @@
 
 Its logs test validation. Deliberate differences: the shaft is a direction in space with an angular momentum (a heavy
 symmetric top), not angles; friction is `mu F_n tanh(v_t / 1 mm/s)`; classical Runge-Kutta at steps of 2 us through
-contacts, whose onset is the first step that ends inside the ring; sensors after a Butterworth low-pass of scipy, with
+contacts, whose onset is the first step that ends inside the ring; sensors after a low-pass of scipy, with
 independent noise, clock and shaft angle.
 
     L' = torque,  u' = L x u / Ixx,  w = L . u / Izz,  theta' = w - G' u_x,
@@ -220,6 +220,36 @@ def simulate_pulse(
     return Motion(1.0 / (STEP_S * every), dict(zip(_NAMES, rows.T.copy(), strict=True)), before_s, contacts)
 
 
+LOW_PASSES = ("butterworth", "bessel", "chebyshev", "butterworth-2", "fir", "fir-compensated", "sinc")
+
+
+def apply_low_pass(kind: str, values: np.ndarray, rate_hz: float, corner_hz: float) -> np.ndarray:
+    """Return a signal after one of `LOW_PASSES`, settled at its first value.
+
+    A Chebyshev has 0.5 dB of ripple; a FIR has 3.2 ms; "sinc" is that of a sigma-delta converter: three moving averages
+    in series. Corners are at -3 dB; of a Chebyshev the edge of the passband, of a FIR at -6 dB.
+    """
+    from scipy import signal
+
+    if kind in ("fir", "fir-compensated", "sinc"):
+        average = np.full(round(0.26193 * rate_hz / corner_hz), 1.0)
+        average /= average.sum()
+        half = round(1.6e-3 * rate_hz)
+        taps = signal.firwin(2 * half + 1, corner_hz, fs=rate_hz)
+        taps = np.convolve(np.convolve(average, average), average) if kind == "sinc" else taps
+        ahead = half if kind == "fir-compensated" else 0
+        padded = np.pad(values, (len(taps) - 1 - ahead, ahead), mode="edge")
+        return signal.oaconvolve(padded, taps, mode="valid")
+    sos = {
+        "butterworth": lambda: signal.butter(4, corner_hz, fs=rate_hz, output="sos"),
+        "butterworth-2": lambda: signal.butter(2, corner_hz, fs=rate_hz, output="sos"),
+        "bessel": lambda: signal.bessel(4, corner_hz, norm="mag", fs=rate_hz, output="sos"),
+        "chebyshev": lambda: signal.cheby1(4, 0.5, corner_hz, fs=rate_hz, output="sos"),
+    }[kind]()
+    gain = math.prod(sos[:, :3].sum(axis=1) / sos[:, 3:].sum(axis=1))
+    return signal.sosfilt(sos, values, zi=signal.sosfilt_zi(sos) * values[0])[0] / gain
+
+
 def record_log(
     motion: Motion,
     *,
@@ -227,6 +257,7 @@ def record_log(
     rate_hz: float = 20_000.0,
     ppm: float = 80.0,
     bandwidth_hz: float = 5000.0,
+    low_pass: str | dict[str, str] = "butterworth",
     noise: float = 1.0,
     edit: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = lambda values: values,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -237,20 +268,20 @@ def record_log(
         seed: Of the noise.
         rate_hz: Sample rate by the recorder's own clock [Hz].
         ppm: Error of that clock [ppm]; positive: fast.
-        bandwidth_hz: Of the fourth-order low-pass before the converter; the speed's is 200 Hz.
+        bandwidth_hz: Of the low-pass before the converter; the speed's is 200 Hz.
+        low_pass: Its kind, or kinds by channel; others and the speed have a fourth-order Butterworth.
         noise: Factor of the sensors' noise.
         edit: Changes the signals before the filter: faults of sensors.
     """
-    from scipy.signal import butter, sosfilt, sosfilt_zi
-
     rng = np.random.default_rng(seed)
     n = int((len(motion.values["speed"]) - 4) / motion.rate_hz * rate_hz)
     own_s = np.arange(n) / rate_hz
     place = own_s * (1.0 - ppm * 1e-6) * motion.rate_hz
     found = {}
     for name, values in edit(motion.values).items():
-        sos = butter(4, 200.0 if name == "speed" else bandwidth_hz, fs=motion.rate_hz, output="sos")
-        smooth, _ = sosfilt(sos, values, zi=sosfilt_zi(sos) * values[0])
+        kind = low_pass if isinstance(low_pass, str) else low_pass.get(name, "butterworth")
+        slow = ("butterworth", 200.0) if name == "speed" else (kind, bandwidth_hz)
+        smooth = apply_low_pass(slow[0], values, motion.rate_hz, slow[1])
         found[name] = np.interp(place, np.arange(len(smooth)), smooth)
         found[name] += noise * NOISE[name] * rng.standard_normal(n)
     return own_s, found

@@ -25,8 +25,8 @@ from rig.run.commands.table import COMMANDS, SERVICE_COMMANDS, check_command
 
 _SCENE, _PARAMETERS, _CATALOGUE, _OWN_TABLE = "scene.json", "parameters.json", "catalogue.json", "the scene's own table"
 _CALIBRATION = (
-    "signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "filter_order", "highpass_hz", "noise_v",
-    "adc_v", "adc_bits",
+    "signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "filter", "filter_order", "ripple_db",
+    "group_delay_us", "highpass_hz", "noise_v", "adc_v", "adc_bits",
 )  # fmt: skip
 """Channel fields that determine the conversion of a measured quantity to counts."""
 _CLOCK_STEP_TOLERANCE_S = 60.0

@@ -39,7 +39,7 @@ from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.files import read_file
 from rig.base.text import printable
 from rig.channels.sampling import TICKS_HZ
-from rig.channels.table import TABLE, Channel, ChannelTable, build_table, raw_groups
+from rig.channels.table import TABLE, Channel, ChannelTable, FilterKind, build_table, raw_groups
 
 KIND = "user"
 """Provenance of values from such a file."""
@@ -125,6 +125,9 @@ def check_table(table: ChannelTable) -> None:
             for name in ("bandwidth_hz", "highpass_hz"):
                 if getattr(channel, name) > MAX_BANDWIDTH_HZ:
                     raise InputError(f"{field}.{name}", f"at most {MAX_BANDWIDTH_HZ:g}", getattr(channel, name))
+            if channel.group_delay_us is not None and channel.group_delay_us < (least := 1e6 * channel.half_length_s):
+                must = f"at least {least:.6g}, half of the filter's length, as samples are not delayed here"
+                raise InputError(f"{field}.group_delay_us", must, channel.group_delay_us)
             if (channel.rate_hz, channel.group) != (group.rate_hz, group.name):
                 raise InputError(f"{field}.rate_hz", f"that of its group, {group.rate_hz}", channel.rate_hz)
             gain = channel.sensitivity_v / channel.si
@@ -201,7 +204,7 @@ def _check_kinds(row: dict[str, Any]) -> None:
     """Refuse text and Boolean values in number fields."""
     for name, field in Channel.model_fields.items():
         value = row.get(name)
-        if field.annotation is not str and isinstance(value, bool | str):
+        if field.annotation not in (str, FilterKind) and isinstance(value, bool | str):
             raise InputError(f"channel {row['name']}.{name}", "a number", value)
 
 

@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Collection, Iterable
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
@@ -21,6 +21,16 @@ from rig.base.errors import InputError, UnknownNameError, Words
 VERSION = 2
 """Version of new tables; increased when the rig's own table changes, because recordings are compared with it."""
 TABLE = Path(__file__).with_name("channels.toml")
+
+
+FilterKind = Literal["butterworth", "bessel", "chebyshev", "fir", "sinc", "none"]
+ORDERS: dict[str, tuple[int, int, int]] = {
+    "butterworth": (4, 1, 8), "bessel": (4, 1, 8), "chebyshev": (4, 1, 8), "fir": (64, 8, 1024), "sinc": (3, 2, 8),
+    "none": (4, 1, 8),
+}  # fmt: skip
+"""Orders by kind of filter: default, smallest, largest."""
+LINEAR_PHASE = ("fir", "sinc")
+"""Filters with a constant delay, which a recorder may have compensated."""
 
 
 class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
@@ -41,9 +51,15 @@ class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     range_v: tuple[float, float]
     """Output limits of the conditioner [V]."""
     bandwidth_hz: PositiveFloat
-    """-3 dB corner of the anti-alias low-pass [Hz]."""
-    filter_order: Annotated[int, Field(ge=1, le=8)] = 4
-    """Order of that Butterworth low-pass."""
+    """Corner of the anti-alias low-pass [Hz]: -3 dB; chebyshev: edge of the passband; fir: -6 dB."""
+    filter: FilterKind = "butterworth"
+    """Kind of that low-pass; `sinc` is the decimation filter of a sigma-delta converter."""
+    filter_order: int = Field(default_factory=lambda data: ORDERS[data.get("filter", "butterworth")][0])
+    """Its order; fir: of a Hamming design at the sample rate; sinc: number of moving averages in series."""
+    ripple_db: Annotated[float, Field(gt=0, le=12)] = 0.5
+    """Ripple in the passband of a chebyshev [dB]."""
+    group_delay_us: float | None = None
+    """Delay of a fir or sinc [us]; 0: compensated; None: half of its length, as without compensation."""
     highpass_hz: Annotated[float, Field(ge=0)]
     """AC coupling [Hz]; 0 is DC-coupled."""
     noise_v: Annotated[float, Field(ge=0)]
@@ -57,6 +73,17 @@ class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Provenance of the values, as for parameters."""
 
     @model_validator(mode="after")
+    def _check_filter(self) -> Channel:
+        _, least, most = ORDERS[self.filter]
+        if not least <= self.filter_order <= most:
+            must = f"from {least} to {most} for the filter {self.filter}"
+            raise InputError(f"channel {self.name}.filter_order", must, self.filter_order)
+        if self.group_delay_us is not None and self.filter not in LINEAR_PHASE:
+            must = f"left out, as the filter {self.filter} is not one of {', '.join(LINEAR_PHASE)}"
+            raise InputError(f"channel {self.name}.group_delay_us", must, self.group_delay_us)
+        return self
+
+    @model_validator(mode="after")
     def _check_scale(self) -> Channel:
         if self.sensitivity_v == 0.0:
             raise InputError(f"channel {self.name}.sensitivity_v", "non-zero", self.sensitivity_v)
@@ -67,6 +94,30 @@ class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         if not (math.isfinite(self.scale) and self.scale and math.isfinite(self.offset)):
             raise InputError(f"channel {self.name}.sensitivity_v", "one that gives a finite scale", self.sensitivity_v)
         return self
+
+    @property
+    def half_length_s(self) -> float:
+        """Half of the length of a linear-phase filter's impulse response [s]; 0 for other filters."""
+        if self.filter == "sinc":
+            return 0.5 * self.filter_order * self.average_s
+        return 0.5 * self.filter_order / self.rate_hz if self.filter == "fir" else 0.0
+
+    @property
+    def average_s(self) -> float:
+        """Length of each moving average of a sinc filter [s]."""
+        x = np.linspace(0.01, 0.99, 9801)
+        return float(np.interp(-(0.5 ** (0.5 / self.filter_order)), -np.sinc(x), x)) / self.bandwidth_hz
+
+    @property
+    def low_pass(self) -> tuple[float | str | None, ...]:
+        """The numbers of the low-pass, equal for equal filters."""
+        return self.filter, self.bandwidth_hz, self.filter_order, self.ripple_db, self.group_delay_us
+
+    @property
+    def shape(self) -> dict[str, Any]:
+        """Fields of the low-pass, except for its corner, that differ from those of a fourth-order Butterworth."""
+        plain = {"filter": "butterworth", "filter_order": 4, "ripple_db": 0.5, "group_delay_us": None}
+        return {key: getattr(self, key) for key, value in plain.items() if getattr(self, key) != value}
 
     @property
     def has_range(self) -> bool:

@@ -231,7 +231,21 @@ WRONG = {
         "channel a.range_v must be two ascending values inside",
     ),
     "no bits": (channel("adc_bits = 4"), "channel a.adc_bits must be greater than or equal to 8"),
-    "many poles": (channel("filter_order = 12"), "channel a.filter_order must be less than or equal to 8"),
+    "many poles": (
+        channel("filter_order = 12"),
+        "channel a.filter_order must be from 1 to 8 for the filter butterworth",
+    ),
+    "unknown filter": (channel('filter = "elliptic"'), "channel a.filter must be 'butterworth', 'bessel', "),
+    "short filter": (
+        channel('filter = "fir", filter_order = 4'),
+        "a.filter_order must be from 8 to 1024 for the filter",
+    ),
+    "delay of poles": (
+        channel("group_delay_us = 80"),
+        "a.group_delay_us must be left out, as the filter butterworth is",
+    ),
+    "compensated, live": (channel('filter = "sinc", group_delay_us = 0'), "a.group_delay_us must be at least "),
+    "no ripple": (channel("ripple_db = 0"), "channel a.ripple_db must be greater than 0"),
     "noise below zero": (channel("noise_v = -1"), "channel a.noise_v must be greater than or equal to 0"),
     "bandwidth beyond any row": (channel("bandwidth_hz = 1e6"), "channel a.bandwidth_hz must be at most 130000"),
     "unknown field": (channel("sensitivty_v = 1"), "channel a.sensitivty_v must be a known field"),

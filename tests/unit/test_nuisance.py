@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 import os
 import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +15,12 @@ import pytest
 
 from recorder.reader import Recording
 from replays.recordings.formats.conversion import convert, write_recording
-from replays.recordings.formats.mapping import load_mapping
+from replays.recordings.formats.mapping import load_mapping, parse_mapping
 from replays.recordings.identification.agreement import solve_weighted
 from replays.recordings.identification.log import identify_log
 from replays.recordings.identification.nuisance import find_nuisances, tune
 from replays.recordings.resimulation.experiment import Experiment, is_imported
+from replays.recordings.resimulation.prediction import predict, read_measured
 from replays.recordings.resimulation.sensitivity import ANGLE, get_value, with_values
 from replays.recordings.validation import load_criteria, validate
 from replays.recordings.validation.explanations.signals import edge_faults
@@ -60,6 +64,21 @@ source = "keyphasor"
 )
 
 
+LOW_PASSES = {
+    "butterworth": "", "bessel": 'filter = "bessel"\n', "chebyshev": 'filter = "chebyshev"\nripple_db = 0.5\n',
+    "butterworth-2": "filter_order = 2\n", "fir": 'filter = "fir"\nfilter_order = 64\n', "sinc": 'filter = "sinc"\n',
+}  # fmt: skip
+"""Lines of a mapping for the low-passes of `second_rig`."""
+
+
+def map_low_pass(kind: str, names: Sequence[str] = ()) -> str:
+    """Return the mapping of all channels; a kind of low-pass is told for some channels, else for all but the speed."""
+    parts = WHOLE.split("[channels.")
+    names = names or [name for name in second_rig.UNITS if name != "speed"]
+    told = (LOW_PASSES[kind] * (part.partition("]")[0] in names) for part in parts[1:])
+    return parts[0] + "".join(f"[channels.{part}{lines}" for part, lines in zip(parts[1:], told, strict=True))
+
+
 def import_log(folder: Path, columns: dict[str, np.ndarray], mapping: str, head: str = HEAD) -> Recording:
     """Import columns of another recorder; return the recording."""
     import pyarrow as pa
@@ -100,6 +119,32 @@ def import_all_channels(
     )
     own_s, values = fault.samples(own_s, values)
     return import_log(folder, {"time": own_s, **values}, WHOLE)
+
+
+@pytest.mark.parametrize("kind", ["sinc", *(pytest.param(kind, marks=MATRIX) for kind in LOW_PASSES if kind != "sinc")])
+def test_an_aligned_log_behind_any_known_low_pass_is_good(kind: str, motion: second_rig.Motion, tmp_path: Path) -> None:
+    own_s, values = second_rig.record_log(motion, seed=3, ppm=PPM, low_pass=kind)
+    assert validate(import_log(tmp_path, {"time": own_s, **values}, map_low_pass(kind))).good
+
+
+def test_a_channel_with_its_own_filter_takes_no_shape_from_the_defaults() -> None:
+    text = '[channels.P_N]\nsource = "a"\n[channels.P_S]\nsource = "b"\nfilter = "sinc"\nbandwidth_hz = 900\n'
+    data = tomllib.loads('[defaults]\nfilter = "chebyshev"\nripple_db = 1\nbandwidth_hz = 500\n' + text)
+    north, south = parse_mapping(data, name="log.toml").channels.values()
+    assert (north.shape, north.bandwidth_hz) == ({"filter": "chebyshev", "ripple_db": 1.0}, 500.0)
+    assert (south.shape, south.bandwidth_hz) == ({"filter": "sinc"}, 900.0)
+
+
+def test_a_compensated_filter_is_the_delayed_one_moved(motion: second_rig.Motion, tmp_path: Path) -> None:
+    own_s, values = second_rig.record_log(motion, seed=3, ppm=0.0)
+    recording = import_log(tmp_path, {"time": own_s, **values}, map_low_pass("fir"))
+    experiment = Experiment.from_recording(recording)
+    part = read_measured(recording, experiment.scene)["accelerations"].select_until(0.9).select_from(0.7)
+    sooner = tuple(channel.model_copy(update={"group_delay_us": 0.0}) for channel in part.channels)
+    moved = replace(part, channels=sooner, times_s=part.times_s - 1.6e-3)
+    late, early = (predict(experiment, {one.group: one}).values[one.group] for one in (part, moved))
+    np.testing.assert_allclose(early, late, atol=1e-5)
+    assert np.ptp(late) > 1e-3
 
 
 def test_the_second_rig_is_one_of_this_kind(motion: second_rig.Motion) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from rig.channels.sensors.conditioning import Conditioner
-from rig.channels.sensors.filters import channel_poles
+from rig.channels.sensors.filters import channel_poles, low_pass_response
 from rig.channels.sensors.keyphasor import Keyphasor
 from rig.channels.sensors.noise import EDGE, draw, noise_streams
-from rig.channels.table import Channel, Group, default_table
+from rig.channels.table import Channel, FilterKind, Group, default_table
 from rig.physics.kernels.signals import COLUMN, N_ROW
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
@@ -221,6 +221,59 @@ def test_the_chain_is_the_closed_form_of_its_filters_at_any_rate(rate_hz: int, o
             cubic = (2.0 * math.pi * frequency_hz / ROW_RATE) ** 4 / 24.0
             settled = 2e-4 if channel.highpass_hz else 2e-6
             assert abs(measured - compute_transfer(channel, frequency_hz)) < cubic + settled, (name, frequency_hz)
+
+
+def design_low_pass(channel: Channel, hz: float) -> complex:
+    """Return the response of a channel's low-pass from scipy's designs; a sinc from its moving averages."""
+    from scipy.signal import bessel, cheby1, firwin, freqs, freqz
+
+    turn = 2.0 * math.pi * hz
+    if channel.filter == "fir":
+        taps = firwin(64 * channel.filter_order + 1, channel.bandwidth_hz, fs=64 * channel.rate_hz)
+        return complex(freqz(taps, worN=[hz], fs=64 * channel.rate_hz)[1][0])
+    if channel.filter == "sinc":
+        length_s = 0.26193 / channel.bandwidth_hz  # -3 dB of the third power at the corner
+        return complex((np.sinc(hz * length_s) * np.exp(-0.5j * turn * length_s)) ** 3)
+    corner = 2.0 * math.pi * channel.bandwidth_hz
+    order, ripple = channel.filter_order, channel.ripple_db
+    design = bessel(order, corner, analog=True, norm="mag")
+    b, a = design if channel.filter == "bessel" else cheby1(order, ripple, corner, analog=True)
+    return complex(freqs(b, a, [turn])[1][0] * a[-1] / b[-1])
+
+
+KINDS = [("bessel", 4), ("bessel", 3), ("chebyshev", 4), ("chebyshev", 5), ("fir", 64), ("sinc", 3)]
+
+
+@pytest.mark.parametrize(("kind", "order"), KINDS)
+def test_filters_of_each_kind_are_scipys_designs(kind: FilterKind, order: int) -> None:
+    of = {"filter": kind, "filter_order": order, "highpass_hz": 0.0}
+    channel = default_table().channels["inner_x"].model_copy(update=of)
+    for frequency_hz in (150.0, 1_000.0, 2_500.0, 5_000.0):
+        designed = design_low_pass(channel, frequency_hz)
+        cubic = (2.0 * math.pi * frequency_hz / ROW_RATE) ** 4 / 24.0
+        assert abs(low_pass_response(channel, np.array([2j * math.pi * frequency_hz]))[0] - designed) < 1e-4
+        assert abs(measure_response(channel, frequency_hz, seconds=0.08) - designed) < cubic + 2e-3
+
+
+def test_a_linear_phase_filter_delays_by_any_part_of_a_row() -> None:
+    for kind, order in (("fir", 64), ("sinc", 3)):
+        for late_us in (1_600.0, 1_612.5, 2_003.7):
+            of = {"filter": kind, "filter_order": order, "group_delay_us": late_us, "highpass_hz": 0.0}
+            measured = measure_response(default_table().channels["inner_x"].model_copy(update=of), 500.0, seconds=0.08)
+            late = measured * np.exp(2j * math.pi * 500.0 * 1e-6 * late_us)
+            assert abs(np.angle(late)) < 3e-4, (kind, late_us)
+
+
+@pytest.mark.parametrize("kind", ["fir", "sinc"])
+def test_blocks_do_not_change_a_bit_of_a_linear_phase_filter(kind: FilterKind) -> None:
+    channel = default_table().channels["P_E"].model_copy(update={"filter": kind, "filter_order": 8})
+    group = group_of("forces").model_copy(update={"channels": (channel, default_table().channels["P_W"])})
+    rows = rows_of("P_E", np.random.default_rng(1).standard_normal(1001).cumsum())
+    whole = Conditioner([group], row_rate_hz=ROW_RATE, seed=0, noise=False).counts(rows)["forces"]
+    for first in (1, 7, 500):
+        chain = Conditioner([group], row_rate_hz=ROW_RATE, seed=0, noise=False)
+        parts = [chain.counts(rows[: first + 1])["forces"], chain.counts(rows[first:])["forces"]]
+        np.testing.assert_array_equal(np.concatenate(parts), whole)
 
 
 @pytest.mark.parametrize("rate_hz", RATES)

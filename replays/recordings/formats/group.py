@@ -14,7 +14,7 @@ from replays.recordings.formats import clock
 from replays.recordings.formats.exporting.selection import NO_VOLTS
 from replays.recordings.formats.guessing import noise
 from replays.recordings.formats.mapped import BITS, MappedSignal
-from replays.recordings.formats.mapping import Mapping
+from replays.recordings.formats.mapping import LowPass, Mapping
 from rig.base import units
 from rig.base.checks import check
 from rig.base.errors import InputError, Words
@@ -325,7 +325,8 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, n
             "kind": NO_VOLTS if volts_per_unit is None else "imported",
         }
     )  # fmt: skip
-    channel = check(Channel, channel.model_dump(), field=f"channels.{entry.name}")
+    shapeless = channel.model_dump(exclude={*LowPass.model_fields} - {"bandwidth_hz"})
+    channel = check(Channel, shapeless | entry.mapping.shape, field=f"channels.{entry.name}")
     if keeps and raw is not None:
         return channel, raw.astype(np.int32), f"integers of the source, {abs(channel.scale):.6g} {channel.unit} each"
     counts = np.rint((np.nan_to_num(values) - channel.offset) / channel.scale)

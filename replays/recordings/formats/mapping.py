@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, f
 from rig.base import units
 from rig.base.checks import check, read_toml
 from rig.base.errors import InputError
+from rig.channels.table import FilterKind
 
 _EPOCH = re.compile(r"\b(unix|epoch|posix|since|from|the|1970(-01-01)?|utc)\b", re.IGNORECASE)
 """Words for the origin of a time scale, which do not affect its unit."""
@@ -136,7 +137,24 @@ class SignalName(_Section):
     """File name, if there are several files."""
 
 
-class ChannelMapping(SignalName):
+class LowPass(_Section):
+    """Anti-aliasing low-pass; the values are those of a channel table."""
+
+    bandwidth_hz: PositiveFloat | None = None
+    """Its corner [Hz]; omitted: half of the rate is assumed."""
+    filter: FilterKind | None = None
+    """Its kind; omitted: butterworth."""
+    filter_order: int | None = None
+    ripple_db: FiniteFloat | None = None
+    group_delay_us: FiniteFloat | None = None
+
+    @property
+    def shape(self) -> dict[str, Any]:
+        """Kind, order, ripple and delay, as far as given."""
+        return self.model_dump(include={*LowPass.model_fields} - {"bandwidth_hz"}, exclude_none=True)
+
+
+class ChannelMapping(SignalName, LowPass):
     """Conversion of one signal to one channel: value = sign * factor * (source - bias), in the channel's unit."""
 
     unit: str | None = None
@@ -152,8 +170,6 @@ class ChannelMapping(SignalName):
     """Source value at zero, in its unit, or the mean of the imported range."""
     delay_us: FiniteFloat = 0.0
     """Delay of the source [us], for example of a filter or a multiplexer."""
-    bandwidth_hz: PositiveFloat | None = None
-    """Corner of the anti-aliasing low-pass [Hz]; omitted: half of the rate is assumed."""
     highpass_hz: Annotated[FiniteFloat, Field(ge=0.0)] = 0.0
     """Corner of an AC coupling [Hz]; 0: none."""
     full_scale: PositiveFloat | None = None
@@ -174,11 +190,8 @@ class ChannelMapping(SignalName):
         return factor
 
 
-class Defaults(_Section):
+class Defaults(LowPass):
     """Defaults for channels that do not set the value themselves."""
-
-    bandwidth_hz: PositiveFloat | None = None
-    """Corner of the anti-aliasing low-pass [Hz]."""
 
 
 class Rotate(_Section):
@@ -301,14 +314,11 @@ def parse_mapping(data: dict[str, Any], *, name: str) -> Mapping:
     experiment = mapping.experiment
     if experiment is not None and experiment.commands == "detected" and mapping.hammer is None:
         raise InputError(f"{name}: experiment.commands", "used together with a table [hammer]", "detected")
-    if mapping.defaults.bandwidth_hz is None:
-        return mapping
-    corner = {"bandwidth_hz": mapping.defaults.bandwidth_hz}
-    channels = {
-        channel: entry if entry.bandwidth_hz is not None else entry.model_copy(update=corner)
-        for channel, entry in mapping.channels.items()
-    }
-    for channel, entry in channels.items():
-        if mapping.channels[channel].bandwidth_hz is None:
-            entry.model_fields_set.discard("bandwidth_hz")  # still counts as a default in later checks
+    channels = {}
+    for channel, entry in mapping.channels.items():
+        shape = entry.shape if entry.filter else mapping.defaults.shape | entry.shape
+        corner_hz = entry.bandwidth_hz or mapping.defaults.bandwidth_hz
+        channels[channel] = entry.model_copy(update=shape | {"bandwidth_hz": corner_hz})
+        if entry.bandwidth_hz is None:
+            channels[channel].model_fields_set.discard("bandwidth_hz")  # still counts as a default in later checks
     return mapping.model_copy(update={"channels": channels})

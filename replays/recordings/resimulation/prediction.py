@@ -19,6 +19,7 @@ from rig.base.errors import InputError
 from rig.channels.formula import Formulas
 from rig.channels.sampling import has_few_positions, lagrange, sample_spacing
 from rig.channels.sensors.conditioning import Conditioner
+from rig.channels.sensors.filters import delay_s
 from rig.channels.table import Channel, Group, default_table
 from rig.run.offline import frames
 from rig.run.scenes import Scene, rig_table
@@ -213,7 +214,16 @@ class _Channels:
     ) -> None:
         self._parts, self._rate_hz = parts, rate_hz
         self.apart, self._in_a_row = sample_spacing(rate_hz, row_rate_hz)
-        groups = [Group(name=part.group, title=part.group, rate_hz=rate_hz, channels=part.fine) for part in parts]
+        # A compensated filter needs later rows: it is computed with a delay of whole samples, which is then removed.
+        self._leads = {part.group: [math.ceil(lead_s(channel) * rate_hz) for channel in part.fine] for part in parts}
+        groups = []
+        for part in parts:
+            channels = list(part.fine)
+            for c, lead in enumerate(self._leads[part.group]):
+                if lead:
+                    late = {"group_delay_us": 1e6 * (delay_s(channels[c]) + lead / rate_hz)}
+                    channels[c] = channels[c].model_copy(update=late)
+            groups.append(Group(name=part.group, title=part.group, rate_hz=rate_hz, channels=tuple(channels)))
         self._groups = {group.name: group for group in groups}
         self._conditioner = Conditioner(
             groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal, digital=digital,
@@ -239,8 +249,15 @@ class _Channels:
         values_by_group = {}
         for part in self._parts:
             values = self._groups[part.group].engineering(np.concatenate(self._counts[part.group]))
+            for c, lead in enumerate(self._leads[part.group]):
+                values[:, c] = values[np.minimum(np.arange(len(values)) + lead, len(values) - 1), c]
             values_by_group[part.group] = interpolate_rows(values, part.times_s * self._rate_hz - self._first)
         return values_by_group
+
+
+def lead_s(channel: Channel) -> float:
+    """Return the time by which a compensated filter responds before its input [s]."""
+    return max(0.0, channel.half_length_s - delay_s(channel))
 
 
 def interpolate_rows(values: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -351,6 +368,7 @@ def predict(
         parts = {name: part.select_until(end_s) for name, part in parts.items()}
     parts = {name: part for name, part in parts.items() if len(part.times_s)}
     last_s = max((float(part.times_s[-1]) for part in parts.values()), default=0.0)
+    last_s += max((lead_s(channel) for part in parts.values() for channel in part.channels), default=0.0)
     simulation = experiment.simulation()
     if experiment.scene.generator is not None:
         if follow is not None:
@@ -404,6 +422,7 @@ def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chun
         return 0
     corners = [c.highpass_hz for part in parts.values() for c in part.channels if c.highpass_hz]
     settled_s = _LOW_PASS_SETTLING_S + _HIGH_PASS_SETTLING / (2.0 * math.pi * min(corners, default=math.inf))
+    settled_s += max(2.0 * c.half_length_s + delay_s(c) for part in parts.values() for c in part.channels)
     first_s = min(float(part.times_s[0]) for part in parts.values()) - settled_s
     return max(0, math.floor(first_s / chunk_s)) * chunk * (TICK_RATE_HZ // row_rate_hz)
 

@@ -15,7 +15,13 @@ import numpy as np
 from numba import njit
 
 from rig.channels.sampling import sample_spacing
-from rig.channels.sensors.filters import POLE, channel_poles, coefficients, digital_coefficients
+from rig.channels.sensors.filters import (
+    POLE,
+    channel_poles,
+    coefficients,
+    digital_coefficients,
+    linear_phase_taps,
+)
 from rig.channels.sensors.noise import draw, noise_streams
 from rig.channels.table import Channel, Group, check_signals
 from rig.physics.kernels.signals import COLUMN
@@ -99,6 +105,15 @@ def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
                     + (step[of + 8 * _LANES + c] * before + step[of + 9 * _LANES + c] * first)
                 )
     return late
+
+
+@kernel
+def _weigh(taps, volts, out):
+    """Add the weighted rows to `out`, shape (n, channels), from `volts`, shape (n + taps - 1, channels)."""
+    for n in range(len(out)):
+        for tap in range(len(taps)):
+            for c in range(out.shape[1]):
+                out[n, c] += taps[tap, c] * volts[n + tap, c]
 
 
 @kernel
@@ -236,6 +251,16 @@ class Conditioner:
             none if ideal or math.isinf(channel.bandwidth_hz) else channel_poles(channel, row_rate_hz)
             for channel in channels
         ]
+        taps = {
+            c: each for c, channel in enumerate(channels)
+            if not ideal and len(each := linear_phase_taps(channel, row_rate_hz))
+        }  # fmt: skip
+        self._with_taps = list(taps)
+        self._taps = np.zeros((max(map(len, taps.values()), default=1), len(taps)))
+        for column, each in enumerate(taps.values()):
+            self._taps[len(self._taps) - len(each) :, column] = each
+        self._tail: np.ndarray | None = None
+        """Signals of the linear-phase filters before the first row [V], shape (taps - 1, such channels)."""
         most = max(len(poles) for poles, _, _ in filters)
         sets = -(-len(channels) // _LANES)
         # Unused lanes produce zeros.
@@ -267,6 +292,7 @@ class Conditioner:
         self._lanes = {channel.name: divmod(c, _LANES) for c, channel in enumerate(channels)}
         self._inherited: list[tuple[str, np.ndarray, np.ndarray]] = []
         """Channels of a twin before its first rows, with their pole states and earlier volts."""
+        self._inherited_tails: dict[int, np.ndarray] = {}
         self._streams = noise_streams([channel.name for channel in channels] if noise and not ideal else [], seed)
 
     @property
@@ -302,7 +328,9 @@ class Conditioner:
             at = list(mine).index(name), list(theirs).index(name)
             if len(self._streams) and len(other._streams):
                 self._streams[at[0]] = other._streams[at[1]]
-            filters = [(one.bandwidth_hz, one.filter_order, one.highpass_hz) for one in (mine[name], theirs[name])]
+            filters = [(one.low_pass, one.highpass_hz) for one in (mine[name], theirs[name])]
+            if filters[0] == filters[1] and other._tail is not None and at[0] in self._with_taps:
+                self._inherited_tails[at[0]] = other._tail[:, other._with_taps.index(at[1])].copy()
             if filters[0] == filters[1] and other._past is not None:
                 part, lane = other._lanes[name]
                 waves = other._waves[part].reshape(-1, _LANES)[:, lane].copy()
@@ -321,7 +349,7 @@ class Conditioner:
     def __deepcopy__(self, memo: dict[int, Any]) -> Conditioner:
         """Return a copy with its own states; constant arrays are shared."""
         other = copy.copy(self)
-        for name in ("_waves", "_past", "_streams", "_inherited"):
+        for name in ("_waves", "_past", "_streams", "_inherited", "_tail"):
             setattr(other, name, copy.copy(getattr(self, name)))
         return other
 
@@ -337,8 +365,13 @@ class Conditioner:
         """
         if made is None:
             made = np.empty((len(rows), 0))
+        columns = self._columns
+        if self._with_taps:
+            columns = columns.copy()
+            columns[self._with_taps] = rows.shape[1] + made.shape[1] + np.arange(len(self._with_taps))
+            made = np.hstack([made, self._convolve(rows, made)])
         if self._past is None:
-            self._past = self._settle(rows, made)
+            self._past = self._settle(rows, made, columns)
         if self._inherited:
             self._restore_inherited()
         span = (len(rows) - 1) * self._parts
@@ -347,7 +380,7 @@ class Conditioner:
         # Sums of unsigned integers wrap; without compilation, numpy would warn about it.
         with np.errstate(over="ignore"):
             _condition(
-                rows, made, self._late, self._apart, self._parts, self._columns, self._places, self._scales, self._past,
+                rows, made, self._late, self._apart, self._parts, columns, self._places, self._scales, self._past,
                 self._waves, self._steps, self._phases, self._streams, counts,
             )  # fmt: skip
         self._late += samples * self._apart - span
@@ -356,10 +389,25 @@ class Conditioner:
             for name, before, width in self._spans
         }
 
-    def _settle(self, rows: np.ndarray, made: np.ndarray) -> np.ndarray:
+    def _convolve(self, rows: np.ndarray, made: np.ndarray) -> np.ndarray:
+        """Return the signals of the channels with linear-phase filters after these [SI], shape (n, such channels)."""
+        of = self._with_taps
+        gain, bias, low, high = (self._scales[:, row].ravel()[of] for row in (_GAIN, _BIAS, _LOW, _HIGH))
+        volts = np.clip(bias + gain * np.hstack([rows, made])[:, self._columns[of]], low, high)
+        if self._tail is None:
+            self._tail = np.repeat(volts[:1], len(self._taps) - 1, axis=0)
+            for c, tail in self._inherited_tails.items():
+                self._tail[len(self._tail) - len(tail) :, of.index(c)] = tail[-len(self._tail) :]
+        volts = np.concatenate([self._tail, volts])
+        filtered = np.zeros((len(rows), len(of)))
+        _weigh(self._taps, volts, filtered)
+        self._tail = volts[len(rows) - 1 : -1]
+        return (filtered - bias) / gain
+
+    def _settle(self, rows: np.ndarray, made: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Set the filters to the steady state of the first row, and return its volts, twice."""
         first = np.zeros(len(self._scales) * _LANES)
-        first[: len(self._columns)] = np.concatenate([rows[0], made[0]])[self._columns]
+        first[: len(self._columns)] = np.concatenate([rows[0], made[0]])[columns]
         volts = self._scales[:, _BIAS] + self._scales[:, _GAIN] * first.reshape(-1, _LANES)
         volts = np.clip(volts, self._scales[:, _LOW], self._scales[:, _HIGH])
         self._waves[:] = (self._settling * volts[:, None, None, :]).reshape(self._waves.shape)

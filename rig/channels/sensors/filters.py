@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from rig.channels.table import Channel
+from rig.channels.table import LINEAR_PHASE, Channel
 
 _NODES = (1.0, 0.0, -1.0, -2.0)
 """Positions of the four rows of a cubic, in rows from the start of its interval."""
@@ -29,27 +30,102 @@ POLE = 10
 def channel_poles(channel: Channel, row_rate_hz: float = math.inf) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the poles of a channel's filters [rad/s], one of each pair, their residues, and the direct gain.
 
-    The filters are a Butterworth low-pass at the channel's bandwidth, omitted if it is above what rows represent, and a
-    first-order high-pass for an AC-coupled channel.
+    The filters are the channel's low-pass, omitted if it is above what rows represent or not of this kind (see
+    `linear_phase_taps`), and a first-order high-pass for an AC-coupled channel.
     """
-    order = channel.filter_order if channel.bandwidth_hz < 0.45 * row_rate_hz else 0
+    by_poles = channel.filter not in (*LINEAR_PHASE, "none") and channel.bandwidth_hz < 0.45 * row_rate_hz
+    order = channel.filter_order if by_poles else 0
     corner, highpass = 2.0 * math.pi * channel.bandwidth_hz, 2.0 * math.pi * channel.highpass_hz
     if order and abs(highpass - corner) < _MIN_CORNER_GAP * corner:
         highpass = (1.0 - _MIN_CORNER_GAP) * corner
     angles = [math.pi * (2 * n + order + 1) / (2 * order) for n in range(order)]
     low = [corner * complex(math.cos(angle), math.sin(angle)) for angle in angles]
+    factors: list[complex] = [complex(corner)] * order
+    if order and channel.filter != "butterworth":
+        low = _poles_of(channel.filter, order, channel.ripple_db, corner)
+        factors = [-pole for pole in low]  # so that the gain at 0 Hz is 1
+        if any(abs(highpass + pole) < _MIN_CORNER_GAP * abs(pole) for pole in low):
+            highpass *= 1.0 - 2.0 * _MIN_CORNER_GAP
     poles, residues = [], []
     for n, pole in enumerate([*low, complex(-highpass)] if highpass else low):
         if pole.imag < -1e-9 * abs(pole):
             continue  # complex conjugate
         residue = complex(pole) if highpass else complex(1.0)
         for m, other in enumerate(low):
-            residue *= corner / (pole - other) if m != n else corner
+            residue *= factors[m] / (pole - other) if m != n else factors[m]
         if n < order and highpass:
             residue /= pole + highpass
         poles.append(pole)
         residues.append(residue * (2.0 if pole.imag > 1e-9 * abs(pole) else 1.0))
     return np.array(poles, complex), np.array(residues, complex), 0.0 if low else 1.0
+
+
+def _poles_of(kind: str, order: int, ripple_db: float, corner: float) -> list[complex]:
+    """Return the poles of a Bessel (-3 dB at its corner) or Chebyshev low-pass [rad/s]."""
+    from scipy.signal import bessel, cheby1
+
+    shape: dict[str, Any] = {"analog": True, "output": "zpk"}
+    made = bessel(order, corner, norm="mag", **shape) if kind == "bessel" else cheby1(order, ripple_db, corner, **shape)
+    return [complex(pole) for pole in made[1]]
+
+
+def delay_s(channel: Channel) -> float:
+    """Return the delay of a linear-phase filter [s]."""
+    return channel.half_length_s if channel.group_delay_us is None else 1e-6 * channel.group_delay_us
+
+
+def linear_phase_taps(channel: Channel, row_rate_hz: float) -> np.ndarray:
+    """Return the weights of the rows before and at an output row, the oldest first, shape (n,); (0,) for other filters.
+
+    A fir is a sinc function in a Hamming window, a sinc filter is a B-spline. The delay may be any fraction of a row.
+    """
+    half_s, rows = channel.half_length_s * row_rate_hz, delay_s(channel) * row_rate_hz
+    if not half_s or channel.bandwidth_hz >= 0.45 * row_rate_hz:
+        return np.empty(0)
+    at = np.arange(math.ceil(rows + half_s), -1.0, -1.0) - rows
+    inside = np.abs(at) <= half_s
+    if channel.filter == "sinc":
+        from scipy.interpolate import BSpline
+
+        knots = np.linspace(-half_s, half_s, channel.filter_order + 1)
+        taps = np.nan_to_num(BSpline.basis_element(knots, extrapolate=False)(at))
+    else:
+        window = 0.54 + 0.46 * np.cos(math.pi * at / half_s)
+        taps = np.where(inside, np.sinc(2.0 * channel.bandwidth_hz / row_rate_hz * at) * window, 0.0)
+    return taps / taps.sum()
+
+
+def low_pass_response(channel: Channel, turn: np.ndarray) -> np.ndarray:
+    """Return the response of a channel's low-pass, without AC coupling.
+
+    Args:
+        channel: The channel.
+        turn: Frequencies times 2 pi i [rad/s], shape (n,).
+    """
+    hz = turn.imag / (2.0 * math.pi)
+    if channel.filter == "sinc":
+        return np.sinc(hz * channel.average_s) ** channel.filter_order * np.exp(-turn * delay_s(channel))
+    if channel.filter == "fir":
+        from scipy.special import sici
+
+        half_s = channel.half_length_s
+
+        def passed(hz: np.ndarray) -> np.ndarray:
+            edges = (2.0 * math.pi * half_s * (hz + sign * channel.bandwidth_hz) for sign in (1.0, -1.0))
+            above, below = (sici(edge)[0] for edge in edges)
+            return above - below
+
+        def windowed(hz: np.ndarray) -> np.ndarray:
+            return 0.54 * passed(hz) + 0.23 * sum(passed(hz + 0.5 * sign / half_s) for sign in (1.0, -1.0))
+
+        return windowed(hz) / windowed(np.zeros(1)) * np.exp(-turn * delay_s(channel))
+    poles, residues, direct = channel_poles(channel.model_copy(update={"highpass_hz": 0.0}))
+    shown = np.full(len(turn), complex(direct))
+    for pole, residue in zip(poles.tolist(), residues.tolist(), strict=True):
+        shown += residue / (turn - pole)
+        if pole.imag:  # one of a pair: its residue is doubled
+            shown += 0.5 * (residue.conjugate() / (turn - pole.conjugate()) - residue / (turn - pole))
+    return shown
 
 
 def _integrals(poles: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -72,7 +72,7 @@ class Column:
                 "offset": channel.offset, "volts_per_count": channel.lsb_v, "sensitivity_v": channel.sensitivity_v,
                 "bias_v": channel.bias_v, "bandwidth_hz": channel.bandwidth_hz, "highpass_hz": channel.highpass_hz,
                 "adc_v": channel.adc_v, "adc_bits": channel.adc_bits, "calibration": channel.kind,
-            }  # fmt: skip
+            } | channel.shape  # fmt: skip
         return about
 
     def describe(self, sensor: str) -> str:

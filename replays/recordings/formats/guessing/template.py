@@ -86,6 +86,7 @@ def _text(sources: Sequence[Source], attached: dict[Path, Attachments], guesses:
         lines += ["", *_channel(each, used_names, several=len(sources) > 1)]
         if (channel := attached[each.source.path].channels.get(each.entry.name)) is not None:
             lines += [f"bandwidth_hz = {channel.bandwidth_hz!r}"]
+            lines += [f"{key} = {json.dumps(value)}" for key, value in channel.shape.items()]
             lines += [f"highpass_hz = {channel.highpass_hz!r}"] * bool(channel.highpass_hz)
         elif each.features.timed and corner_hz > (max_hz := 0.5 * each.features.axis.rate_hz):
             lines += [f"bandwidth_hz = {max_hz:.6g}    # {CHECK}: half of its rate; [defaults] is higher"]
