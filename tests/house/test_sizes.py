@@ -46,7 +46,7 @@ BUDGETS = {
     "rig": 64,
     "rig/base": 1064,
     "rig/channels": 2578,
-    "rig/cli": 5860,
+    "rig/cli": 5941,
     "rig/ensemble": 2019,
     "rig/physics": 5488,
     "rig/run": 1896,

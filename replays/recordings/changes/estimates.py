@@ -25,7 +25,7 @@ MIN_STEADY_ROWS = 256
 """Smallest number of rows for 64 blocks."""
 _MIN_TURNS = 3.0
 """Smallest number of revolutions, or of periods between two tones, for their amplitudes."""
-_MAX_FIT_ROWS = 1 << 17
+_MAX_FIT_ROWS = 1 << 16
 """Largest number of rows in a fit of tones; longer signals are averaged first."""
 _MIN_AMPLITUDE = 5.0
 """Amplitude of a tone over its standard error from which its phase is known."""
@@ -161,7 +161,7 @@ def _tones(values: np.ndarray, turns: np.ndarray | None, rate_hz: float, unit: s
     for hum in HUM_HZ:
         if all(abs(hum - order * speed_hz) * length_s > _MIN_TURNS for order in range(9)):
             tones[f"{hum:g} Hz"] = hum, hum * (np.arange(len(rows)) + 0.5) * n / rate_hz
-    tones = {name: tone for name, tone in tones.items() if tone[0] < 0.2 * rate_hz / n}
+    tones = {name: tone for name, tone in tones.items() if tone[0] < 0.4 * rate_hz / n}
     fit = _Fit(rows, np.column_stack([angle for _, angle in tones.values()]) if tones else np.empty((len(rows), 0)))
     found = {("mean", unit): fit.constant()}
     for place, (name, (frequency, _)) in enumerate(tones.items()):

@@ -1,13 +1,19 @@
-"""`rig validate`: a recording compared with the model."""
+"""`rig validate`: a recording, or all recordings of a folder, compared with the model."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.base.errors import InputError, SimulationError, Words
+from rig.base.outcome import Outcome
 from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges
 from rig.cli.output.progress import reporting
 from rig.cli.output.provenance import recording_origin
@@ -38,12 +44,18 @@ def validate(
     ] = False,
     blind: Annotated[bool, typer.Option("--blind", help="Ignore the faults that the recording declares")] = False,
     report: ReportFile = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for the results of a folder")
+    ] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", metavar="N", min=1, help="Files of a folder at a time")] = 2,
     force: Force = False,
     form: Form,
 ) -> None:
     """Simulate a recording again and compare it with the model: bit by bit, then by declared criteria.
 
-    For a failed criterion, the candidate that explains the difference is named: a sensor, the time or a parameter.
+    For a failed criterion, the candidate that explains the difference is named: a sensor, the time or a parameter. A
+    folder gives a table of its recordings, the worst first, and validations.json; the same command continues an
+    interrupted one, and --force begins again.
     Exit status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
     """
     from recorder.reader import join
@@ -57,9 +69,18 @@ def validate(
     rules = load_criteria(criteria)
     texts = SceneChanges(changes=changes, engine=engine).overrides()
     overrides = {key: read_value(value) for key, value in texts.items()}
+    options: dict[str, Any] = {"criteria": rules, "changes": overrides, "declared": declared, "blind": blind}
+    if any(file.is_dir() for file in files):
+        if len(files) > 1 or report is not None:
+            raise InputError("FILE", "one folder, without --report", Words(" ".join(map(str, files))))
+        rows = _validate_folder(files[0], output or files[0], options, jobs=jobs, force=force)
+        _show_folder(rows, output or files[0], form)
+        return
+    if output is not None:
+        raise InputError("--output", "left out, except for a folder", str(output))
     recording = join(files)
     with reporting(compiles=True) as reporter:
-        result = hold(recording, criteria=rules, changes=overrides, declared=declared, blind=blind, step=reporter.step)
+        result = hold(recording, step=reporter.step, **options)
         if report is not None:
             from replays.recordings.validation.report import make_report
 
@@ -73,6 +94,82 @@ def validate(
             echo(f"report  {report}")
     if result.outcome.exit_status:
         raise typer.Exit(result.outcome.exit_status)
+
+
+def _validate_folder(
+    folder: Path, output: Path, options: dict[str, Any], *, jobs: int, force: bool
+) -> list[dict[str, Any]]:
+    """Return a row for each recording of a folder, the worst first, and write them to validations.json."""
+    from replays.studies.common.journal import Journal
+    from replays.studies.common.provenance import RIG, commit, versions
+    from rig.base.files import lock_folder, write_file
+    from rig.base.text import replace_nonfinite
+    from rig.ensemble.ensemble import iterate_results, local_workers
+
+    files = sorted(folder.glob("*.mcap"))
+    if not files:
+        raise InputError("FILE", "a recording, or a folder with recordings (.mcap)", str(folder))
+    settings = [options["criteria"].model_dump_json(), *map(repr, options.values()), versions(RIG), commit()]
+    lock = lock_folder(output, "rig validate")
+    try:
+        code = hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
+        journal = Journal(output, "validations.jsonl", code, fresh=force)
+        known = {(row["file"], row["stamp"]): row for row in journal.rows}
+        stamps = {file: f"{(status := file.stat()).st_size} {status.st_mtime_ns}" for file in files}
+        left = [k for k, file in enumerate(files) if (file.name, stamps[file]) not in known]
+        with reporting(compiles=True) as reporter, local_workers(jobs) as workers:
+            reporter.begin(len(files))
+            reporter.done = len(files) - len(left)
+            for k, row in iterate_results(workers, left, _validate_file, files, options):
+                row = replace_nonfinite({"file": files[k].name, "stamp": stamps[files[k]], **row, "code": code})
+                journal.add(row)
+                known[row["file"], row["stamp"]] = row
+                reporter.step(f"{row['file']}: {row['outcome']}")
+        rows = [known[file.name, stamps[file]] for file in files]
+        rows.sort(key=lambda row: (_RANKS.index(row["outcome"]), -row["failures"], row["file"]))
+        write_file(output / "validations.json", json.dumps({"folder": str(folder), "rows": rows}, indent=2) + "\n")
+    finally:
+        os.close(lock)
+    return rows
+
+
+_DAMAGED = "not readable"
+_RANKS = (Outcome.FAIL.value, _DAMAGED, Outcome.INCONCLUSIVE.value, Outcome.PASS.value)
+"""Outcomes of a file, the worst first."""
+
+
+def _validate_file(files: list[Path], options: dict[str, Any], number: int, stop: Event) -> dict[str, Any]:
+    """Return the result for a file of a folder; a file that cannot be validated has a reason instead."""
+    from recorder.reader import join
+    from replays.recordings.validation import validate as hold
+
+    def step(_text: str) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+
+    try:
+        result = hold(join([files[number]]), step=step, **options)
+    except (InputError, SimulationError) as error:
+        return {"outcome": _DAMAGED, "failures": 0, "judged": 0, "line": str(error), "cause": ""}
+    return {
+        "outcome": result.outcome.value, "failures": len(result.failures), "judged": result.judged,
+        "line": result.verdict_line, "cause": result.explained.conclusion if result.explained is not None else "",
+    }  # fmt: skip
+
+
+def _show_folder(rows: list[dict[str, Any]], output: Path, form: Form) -> None:
+    outcomes = [Outcome.INCONCLUSIVE if row["outcome"] == _DAMAGED else Outcome(row["outcome"]) for row in rows]
+    if form.as_json:
+        echo_json({"outcome": Outcome.worst(outcomes).value, "rows": rows})
+    else:
+        table = new_table("Validations, the worst first", "file", "outcome", ">failed", "result", wrapped=["result"])
+        for row in rows:
+            text = row["line"] + (f"; {row['cause']}" if row["cause"] else "")
+            table.add_row(row["file"], row["outcome"], f"{row['failures']} of {row['judged']}", text)
+        form.console().print(table)
+        echo(f"results  {output / 'validations.json'}")
+    if status := Outcome.worst(outcomes).exit_status:
+        raise typer.Exit(status)
 
 
 def _show(result: Validation, console: Console) -> None:
