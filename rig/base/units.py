@@ -92,6 +92,12 @@ def canonical(unit: str) -> str:
     return candidates[0] if len(candidates) == 1 else unit.strip()
 
 
+def split_detector(unit: str) -> tuple[str, str]:
+    """Return a unit without the reading of a detector at its end, such as rms, and that reading."""
+    match = _DETECTOR.fullmatch(unit.strip())
+    return (match[1], match[2]) if match and is_known(match[1]) else (unit, "")
+
+
 def is_known(unit: str) -> bool:
     """Return whether a unit can be converted; any known spelling is accepted."""
     return canonical(unit) in _UNITS
@@ -102,9 +108,10 @@ def _unknown(unit: str, also: Iterable[str] = ()) -> str:
     candidates = _find(unit)
     if len(candidates) > 1:
         return f"unambiguous: {' or '.join(candidates)}"
-    if (split := _DETECTOR.fullmatch(unit.strip())) and is_known(split[1]):
-        name = canonical(split[1])
-        return f"a unit of samples, such as {name} ({split[2]} is the reading of a detector; give {name} if it is not)"
+    plain, detector = split_detector(unit)
+    if detector:
+        name = canonical(plain)
+        return f"a unit of samples, such as {name} ({detector} is the reading of a detector; give {name} if it is not)"
     similar = find_similar(canonical(unit), (*_UNITS, *_FOLDED, *also), most=1)
     return f"a known unit{f', such as {canonical(similar[0])}' if similar else ''}"
 

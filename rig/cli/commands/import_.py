@@ -203,17 +203,18 @@ _SPARK = 12
 
 
 def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
-    headings = ("signal", "course", "becomes", "confidence", "reason")
+    headings = ("signal", "course", "becomes", "unit", "confidence", "reason")
     table = new_table("", *headings, wrapped=("signal", "reason"), spare=("course",))
     for guess in guesses:
         unit = f" [{guess.entry.unit}]" if guess.entry.unit else ""
         where = f"{guess.entry.group} " if len({each.entry.group for each in guesses}) > 1 else ""
         reason = guess.why if guess.channel else "not a channel of the rig; kept as a new channel"
-        style = "" if guess.channel and guess.confidence != "ask" else "yellow"
+        style = "" if guess.channel and guess.confidence != "open" else "yellow"
         table.add_row(
             f"{where}{guess.entry.name}{unit}",
             guess.features.sparkline(_SPARK),
             guess.channel or "-",
+            (guess.sensitivity or guess.own_unit) + "?" * bool({"unit", "sensitivity"} & set(guess.asks)),
             guess.confidence if guess.channel else "-",
             reason,
             style=style,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,8 +25,14 @@ _MIN_EDGES, _MAX_INTERVAL_CHANGE = 3, 0.3
 """Minimum number of edges of a pulse train, and limit of the relative change of their intervals."""
 _MIN_PEAK, _MAX_TIME = 20.0, 0.02
 """Peak of a hammer signal over its typical deviation, and the largest fraction of time spent in pulses."""
+_MAX_REBOUND, _NOISE_PEAK = 0.3, 8.0
+"""Limits of a hammer signal's other side: fraction of the peak, and multiple of the typical deviation."""
 _MIN_SAMPLES = 20
 """Minimum number of samples for a comparison of stamps."""
+_BURST_KURTOSIS, _MIN_STEP_RATIO = 10.0, 0.1
+"""Bursts of vibration: least kurtosis, and least ratio of the rms step between samples to the rms value."""
+_ONSET_RATIO, _ONSET_PART = 3.0, 0.1
+"""Onset of motion: multiple of the largest deviation in this first part of a signal."""
 _PEAK_HALF_WIDTH = 4
 """Spectral lines evaluated on each side of a peak."""
 _BLOCKS = " ▁▂▃▄▅▆▇█"
@@ -52,6 +58,11 @@ class SignalFeatures:
     def mean(self) -> float:
         """Mean value."""
         return float(self.values.mean())
+
+    @cached_property
+    def median(self) -> float:
+        """Median value."""
+        return float(np.median(self.values))
 
     @cached_property
     def spread(self) -> float:
@@ -90,16 +101,45 @@ class SignalFeatures:
     @cached_property
     def is_hammer(self) -> bool:
         """True if the signal rests except for short, strong pulses to one side."""
-        rest = float(np.median(self.values))
-        off = np.abs(self.values - rest)
+        signed = self.values - self.median
+        off = np.abs(signed)
         typical = float(np.median(off)) / 0.6745
         peak = float(off.max())
+        if min(float(signed.max()), -float(signed.min())) > max(_MAX_REBOUND * peak, _NOISE_PEAK * typical):
+            return False
         return peak > _MIN_PEAK * typical and float(np.mean(off > 0.3 * peak)) < _MAX_TIME and not len(self.edges)
+
+    @cached_property
+    def moves_in_bursts(self) -> bool:
+        """True if the signal vibrates in bursts about zero, as an acceleration does at impacts."""
+        off = self.values - self.mean
+        steps = float(np.sqrt(np.mean(np.diff(off) ** 2))) if len(off) > 1 else 0.0
+        fast = steps > _MIN_STEP_RATIO * self.spread and not len(self.pulses)
+        return fast and self.kurtosis > _BURST_KURTOSIS and abs(self.mean) < 0.5 * self.spread
+
+    @cached_property
+    def kurtosis(self) -> float:
+        """Fourth moment about the mean over the squared variance; 3 for a normal distribution."""
+        return float(np.mean((self.values - self.mean) ** 4)) / max(self.spread, 1e-75) ** 4
+
+    @cached_property
+    def onset_s(self) -> float:
+        """Time at which the signal leaves the range of its beginning [s]; infinite if it does not."""
+        first = max(1, int(_ONSET_PART * len(self.values)))
+        off = np.abs(self.values - float(np.median(self.values[:first])))
+        late = np.flatnonzero(off > _ONSET_RATIO * off[:first].max())
+        return float(self.axis.instants()[late[0]]) if len(late) and not len(self.pulses) else math.inf
+
+    def before(self, end_s: float) -> SignalFeatures:
+        """Return the features of the part before a time [s]."""
+        rows = int(np.searchsorted(self.axis.instants(), end_s))
+        times_s = None if self.axis.times_s is None else self.axis.times_s[:rows]
+        return replace(self, values=self.values[:rows], axis=replace(self.axis, rows=rows, times_s=times_s))
 
     @property
     def pulse_start_s(self) -> float:
         """Time at which the signal first exceeds a tenth of its largest pulse [s]."""
-        off = np.abs(self.values - float(np.median(self.values)))
+        off = np.abs(self.values - self.median)
         return float(self.axis.instants()[int(np.argmax(off > 0.1 * off.max()))])
 
     @cached_property
@@ -130,6 +170,11 @@ class SignalFeatures:
         """Block means of the signal without their mean, shape (m,)."""
         whole = block_means(self.values, -(-len(self.values) // _COMPARED_SAMPLES))
         return whole - whole.mean()
+
+    @cached_property
+    def lines(self) -> np.ndarray:
+        """Spectrum of `slow` with a Hann window, complex."""
+        return spectrum(self.slow * np.hanning(len(self.slow)), 1 << (len(self.slow) - 1).bit_length())
 
     def sparkline(self, width: int) -> str:
         """Return the signal as a line of block characters, each the value farthest from the mean in its interval."""
@@ -167,22 +212,19 @@ class Relation:
         phase_deg: Phase lead of the first signal at that frequency [degrees].
         coherence: Coherence at that frequency, 0 to 1.
         likeness: Correlation coefficient over all frequencies, -1 to 1.
+        size: Ratio of the first signal's standard deviation to the second's.
     """
 
     hz: float
     phase_deg: float
     coherence: float
     likeness: float
+    size: float
 
     @property
     def quadrature(self) -> bool:
         """True if the signals are in quadrature."""
         return self.coherence > 0.8 and abs(abs(self.phase_deg) - 90.0) < 30.0
-
-    @property
-    def together(self) -> bool:
-        """True if the signals are in phase or in opposite phase."""
-        return self.coherence > 0.8 and abs(abs(self.phase_deg) - 90.0) > 60.0
 
 
 def compute_relation(a: SignalFeatures, b: SignalFeatures) -> Relation | None:
@@ -193,8 +235,7 @@ def compute_relation(a: SignalFeatures, b: SignalFeatures) -> Relation | None:
     norm = math.sqrt(float(x @ x) * float(y @ y))
     if len(x) < 64 or norm == 0.0:
         return None
-    window, rows = np.hanning(len(x)), 1 << (len(x) - 1).bit_length()
-    ax, by = spectrum(x * window, rows), spectrum(y * window, rows)
+    rows, ax, by = 1 << (len(x) - 1).bit_length(), a.lines, b.lines
     power = np.abs(ax) * np.abs(by)
     power[:3] = 0.0
     peak = int(np.argmax(power))
@@ -205,4 +246,5 @@ def compute_relation(a: SignalFeatures, b: SignalFeatures) -> Relation | None:
     return Relation(
         hz=peak * slow_hz / rows, phase_deg=math.degrees(math.atan2(cross.imag, cross.real)),
         coherence=abs(cross) / whole if whole else 0.0, likeness=float(x @ y) / norm,
+        size=math.sqrt(float(x @ x) / float(y @ y)),
     )  # fmt: skip

@@ -19,7 +19,7 @@ _DETAIL_S = 0.3
 _MIN_DETAIL_SAMPLES = 60
 _INTERVALS = 1000
 """Intervals into which a long signal is divided for drawing."""
-_COLOURS = {"sure": BLUE, "likely": BLUE, "ask": RED}
+_COLOURS = {"sure": BLUE, "likely": BLUE, "open": RED}
 
 
 @house_style()

@@ -50,7 +50,7 @@ def guess_mapping(files: Sequence[Path], options: FileOptions | None = None) -> 
     attached = {source.path: read_attachments(source) for source in sources}
     exported = {(path, name) for path, each in attached.items() for name in each.channels}
     guesses = guess_channels(sources, exported=lambda source, entry: (source.path, entry.name) in exported)
-    return _text(sources, attached, guesses), guesses
+    return write_text(sources, attached, guesses), guesses
 
 
 def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
@@ -58,7 +58,8 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
     return guess_mapping(files, options)[0]
 
 
-def _text(sources: Sequence[Source], attached: dict[Path, Attachments], guesses: Sequence[Guess]) -> str:
+def write_text(sources: Sequence[Source], attached: dict[Path, Attachments], guesses: Sequence[Guess]) -> str:
+    """Return the text of a mapping with the guesses, and questions on what is undetermined."""
     lines = [
         f"# Mapping for `rig import {' '.join(_quoted(path.name) for path in attached)} -m THIS.toml -o OUT.mcap`;",
         "# value = sign * factor * (source - bias), in the channel's unit; + is EAST, up, compression. It can be",
@@ -79,11 +80,12 @@ def _text(sources: Sequence[Source], attached: dict[Path, Attachments], guesses:
     filters, corner_hz = _filters(guesses, attached)
     lines += filters
     used_names: set[str] = set()
+    asked: set[tuple[str, str]] = set()
     for each in guesses:
         if each.features.missing == len(each.features.values):
             lines += ["", f"# {_quoted(each.entry.name)} has no numeric values and is omitted"]
             continue
-        lines += ["", *_channel(each, used_names, several=len(sources) > 1)]
+        lines += ["", *_channel(each, used_names, asked, several=len(sources) > 1)]
         if (channel := attached[each.source.path].channels.get(each.entry.name)) is not None:
             lines += [f"bandwidth_hz = {channel.bandwidth_hz!r}"]
             lines += [f"{key} = {json.dumps(value)}" for key, value in channel.shape.items()]
@@ -91,7 +93,7 @@ def _text(sources: Sequence[Source], attached: dict[Path, Attachments], guesses:
         elif each.features.timed and corner_hz > (max_hz := 0.5 * each.features.axis.rate_hz):
             lines += [f"bandwidth_hz = {max_hz:.6g}    # {CHECK}: half of its rate; [defaults] is higher"]
         elif each.channel == "speed":
-            lines += [f"# bandwidth_hz = HZ    # {CHECK}: a tachometer is often slower than the other channels"]
+            lines += ["# bandwidth_hz = HZ    # a tachometer is often slower than the other channels"]
     lines += _event_tables(guesses, several=len(sources) > 1)
     first, about = sources[0].path, attached[sources[0].path]
     if about.experiment:
@@ -255,7 +257,14 @@ def _align_lines(lines: list[str], guesses: Sequence[Guess]) -> list[str]:
     return [sides.get(line.split(" ")[0], line) for line in kept]
 
 
-def _channel(each: Guess, used_names: set[str], *, several: bool) -> list[str]:
+def _channel(each: Guess, used_names: set[str], asked: set[tuple[str, str]], *, several: bool) -> list[str]:
+    def mark(field: str) -> str:
+        """Return the question on a field; it is marked once for all signals of a quantity."""
+        about = ("force" if each.kind == "hammer" else each.kind, field)
+        first = about not in asked
+        asked.add(about)
+        return f"{f'{CHECK}: ' * first}{each.asks[field]}{', as above' * (not first)}"
+
     entry = each.entry
     name = each.channel or re.sub(r"\W+", "_", entry.name).strip("_") or "signal"
     plain, number = name, 2
@@ -264,18 +273,20 @@ def _channel(each: Guess, used_names: set[str], *, several: bool) -> list[str]:
     used_names.add(name)
     rate = f"{entry.rate_hz:.9g} Hz" if entry.rate_hz else "no rate"
     label = f"  {shorten_label(entry)}".rstrip()
-    note = f"{CHECK}: {each.asks['name']} ({each.why})" if "name" in each.asks else f"{each.confidence}: {each.why}"
-    mark = f"    # {note}" if each.channel and each.confidence != SURE else ""
+    note = f"{each.confidence}: {each.why}"
+    if "name" in each.asks:
+        note = f"{mark('name')} ({note})"
+    comment = f"    # {note}" if each.channel and each.confidence != SURE else ""
     lines = [
-        f"[channels.{_key(name)}]{mark}",
+        f"[channels.{_key(name)}]{comment}",
         f"source = {_quoted(entry.name)}    # {entry.rows} values, {rate}{label}",
     ]
     lines += _location(each, several=several)
     has_unit = units.is_known(entry.unit) and entry.unit != ""
     if not each.channel:
         target = entry.unit if has_unit else "1"
-        mark = f"    # {CHECK}: the file has {entry.unit!r}" if entry.unit and not has_unit else ""
-        lines += [f"unit = {_quoted(target)}{mark}"]
+        comment = f"    # {CHECK}: the file has {entry.unit!r}" if entry.unit and not has_unit else ""
+        lines += [f"unit = {_quoted(target)}{comment}"]
         group = re.sub(r"\W+", "_", entry.group or each.source.path.stem).strip("_").lower() or "imported"
         group += "_log" if group in default_table().groups else ""
         return [*lines, f"to = {_quoted(group)}", f"to_unit = {_quoted(target)}"]
@@ -285,7 +296,7 @@ def _channel(each: Guess, used_names: set[str], *, several: bool) -> list[str]:
     }  # fmt: skip
     for field, value in fields.items():
         if value is not None:
-            note = f"    # {CHECK}: {each.asks[field]}" if field in each.asks else ""
+            note = f"    # {mark(field)}" if field in each.asks else ""
             lines.append(f"{field} = {_quoted(value) if isinstance(value, str) else repr(value)}{note}")
     return lines
 
