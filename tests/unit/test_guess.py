@@ -97,7 +97,8 @@ def test_each_signal_is_guessed_correctly(
     if path.name == "c.csv":
         assert (found["speed"].unit, found["speed"].confidence) == ("rpm", "sure")
         assert "against CH8; loaded as CH4 rises" in found["P_N"].why
-        assert found["P_N"].confidence == "open"
+        assert found["P_N"].confidence == "likely"
+        assert "name" in found["P_N"].asks
 
 
 @pytest.mark.parametrize(

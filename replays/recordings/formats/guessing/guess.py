@@ -371,7 +371,8 @@ def _explain_pairs(guesses: Sequence[Guess], relations: Relations, own: set[int]
             each, name = guesses[number], guesses[other].entry.name
             first = number == i
             text = {
-                "against": f"against {name}" if each.kind == "force" else "", "loaded": f"loaded as {name} rises" if first else "",
+                "against": f"against {name}" if each.kind == "force" else "",
+                "loaded": f"loaded as {name} rises" if first else "",
                 "relieved": f"relieved as {name} rises" if first else "", "leads": f"90° from {name}",
             }.get(rule, "")  # fmt: skip
             if rule == "leads" and (found := relations.first(i, j)) is not None:
