@@ -143,6 +143,12 @@ def test_missing_phase_is_inconclusive(impact: Recording, run: Recording, tmp_pa
     assert compare(run, run).outcome is Outcome.PASS
 
 
+def test_phase_that_is_too_short_is_reported(impact: Recording) -> None:
+    result = compare(impact, impact)
+    assert result.missing == ("not compared, as it is too short: phase free run",)
+    assert result.outcome is Outcome.INCONCLUSIVE
+
+
 def test_rotation_and_decay_are_measured() -> None:
     times = np.arange(20_000) / 10_000.0
     noise = 1e-3 * np.random.default_rng(0).standard_normal(len(times))

@@ -383,7 +383,9 @@ def compare(first: Recording, second: Recording) -> Comparison:
         spans = [log.phases[name] for log in logs]
         length_s = min(one.to_s - one.from_s for one in spans)
         estimates = [log.estimates(name, length_s) for log in logs]
-        pairs |= {(name, *key): (one, estimates[1][key]) for key, one in estimates[0].items() if key in estimates[1]}
+        common = {(name, *key): (one, estimates[1][key]) for key, one in estimates[0].items() if key in estimates[1]}
+        missing += [] if common else [f"not compared, as it is too short: phase {name}"]
+        pairs |= common
     events = [log.events() for log in logs]
     pairs |= {(_WHOLE_RUN, *key): (one, events[1][key]) for key, one in events[0].items() if key in events[1]}
     changes = [Change(*key, *pair, tests=len(pairs)) for key, pair in pairs.items()]
