@@ -38,7 +38,7 @@ BUDGETS = {
     "replays/estimate": 378,
     "replays/player": 816,
     "replays/plots": 1710,
-    "replays/recordings": 11421,
+    "replays/recordings": 11447,
     "replays/report": 507,
     "replays/score": 4253,
     "replays/sessions": 77,

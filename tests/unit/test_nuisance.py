@@ -23,8 +23,11 @@ from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import predict, read_measured
 from replays.recordings.resimulation.sensitivity import ANGLE, get_value, with_values
 from replays.recordings.validation import load_criteria, validate
+from replays.recordings.validation.explanations.channel_fit import Shown
 from replays.recordings.validation.explanations.signals import edge_faults
+from replays.recordings.validation.explanations.timing import filtered
 from rig.base.errors import InputError
+from rig.channels.table import default_table
 from rig.run.offline import simulate
 from rig.run.scenes import load_scene
 from tests import faulty_logs, second_rig
@@ -125,6 +128,30 @@ def import_all_channels(
 def test_an_aligned_log_behind_any_known_low_pass_is_good(kind: str, motion: second_rig.Motion, tmp_path: Path) -> None:
     own_s, values = second_rig.record_log(motion, seed=3, ppm=PPM, low_pass=kind)
     assert validate(import_log(tmp_path, {"time": own_s, **values}, map_low_pass(kind))).good
+
+
+@pytest.mark.parametrize("kind", ["bessel", "sinc"])
+def test_another_kind_of_low_pass_than_told_is_named(kind: str) -> None:
+    channel = default_table().channels["inner_x"].model_copy(update={"highpass_hz": 0.0})
+    signal = second_rig.apply_low_pass("fir", np.random.default_rng(1).standard_normal(72_000), 240e3, 4000.0)
+    expected, values = (second_rig.apply_low_pass(each, signal, 240e3, 5000.0)[::12] for each in ("butterworth", kind))
+    times_s, floor = np.arange(len(values)) / 20e3, np.full(len(values), 1e-3)
+    values = values + 1e-3 * np.random.default_rng(2).standard_normal(len(values))
+    laws = [law.change for law in filtered(Shown(channel, times_s, values, expected, floor, 1e-3)) if law.unit == "Hz"]
+    assert any(
+        re.search(rf"of kind {kind} \d near (48|49|50)\d\d Hz, told butterworth of 5000 Hz", law) for law in laws
+    ), laws
+
+
+@MATRIX
+@pytest.mark.parametrize("kind", ["bessel", "sinc"])
+def test_another_low_pass_in_a_log_is_named_with_kinds_like_it(
+    kind: str, motion: second_rig.Motion, tmp_path: Path
+) -> None:
+    own_s, values = second_rig.record_log(motion, seed=3, ppm=PPM, low_pass={"inner_x": kind})
+    found = validate(import_log(tmp_path, {"time": own_s, **values}, WHOLE))
+    assert found.explained is not None
+    assert re.search(rf"inner_x bandwidth low-pass of kind .*{kind} \d", found.explained.conclusion)
 
 
 def test_a_channel_with_its_own_filter_takes_no_shape_from_the_defaults() -> None:

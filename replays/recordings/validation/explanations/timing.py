@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,17 @@ import numpy as np
 from replays.estimate.clock import fit_line, time_error
 from replays.estimate.least_squares import solve
 from replays.estimate.spectra import Spectrum
-from replays.recordings.validation.explanations.channel_fit import MIN_ROWS, Law, Shown, gain_words, least_at, rms_of
+from replays.recordings.validation.explanations.channel_fit import (
+    MARGIN,
+    MIN_ROWS,
+    Law,
+    Shown,
+    gain_words,
+    least_at,
+    rms_of,
+)
 from rig.channels.faults.defects import size_text
-from rig.channels.sensors.filters import channel_poles
+from rig.channels.sensors.filters import low_pass_response
 
 _MAX_LOG_DELAY_S = 4e-3
 """Largest delay of a log's channel in the search."""
@@ -35,6 +44,18 @@ _MAX_QUALITY = 1000.0
 """Quality factor that no transducer reaches."""
 _MAX_RATIO, _MIN_PASS = 0.97, 0.1
 """For a log: largest residual of a low-pass relative to that of a delay, and smallest passed part of the signal."""
+_KINDS: dict[str, dict[str, Any]] = {
+    name: {"filter": name.split()[0], "filter_order": order, "group_delay_us": late_us}
+    for name, order, late_us in (
+        ("butterworth 4", 4, None), ("butterworth 2", 2, None), ("bessel 4", 4, None), ("chebyshev 4", 4, None),
+        ("sinc 3", 3, None), ("sinc 3 compensated", 3, 0.0), ("fir 64", 64, None), ("fir 64 compensated", 64, 0.0),
+    )
+}  # fmt: skip
+"""Low-passes tried for a channel of a log."""
+_KIND_TOLERANCE = 1.2
+"""Ratio of the sums of squares of two kinds that are not distinguished, as samples do not show what is aliased."""
+_MAX_CORNER_RATIO, _MIN_RESPONSE = 2.0, 1e-3
+"""Largest corner tried, relative to the told one, and smallest response of the told filter that is inverted."""
 _MIN_SETTLED_PART = 0.3
 """Part of the difference that must remain after a filter has settled."""
 _MAX_NOISE_PART = 0.8
@@ -153,19 +174,11 @@ def filtered(one: Shown) -> Iterator[Law]:
         return
     begin, wave = _find_wave(one)
 
-    def through(corner_hz: float) -> np.ndarray:
-        poles, residues, direct = channel_poles(
-            channel.model_copy(update={"bandwidth_hz": corner_hz, "highpass_hz": 0.0})
-        )
-        turn = wave.turn
-        shown = np.full(len(turn), complex(direct))
-        for pole, residue in zip(poles.tolist(), residues.tolist(), strict=True):
-            shown += residue / (turn - pole)
-            if pole.imag:  # one of a pair: its residue is doubled
-                shown += 0.5 * (residue.conjugate() / (turn - pole.conjugate()) - residue / (turn - pole))
-        return shown
+    def through(corner_hz: float, shape: Mapping[str, Any] = MappingProxyType({})) -> np.ndarray:
+        return low_pass_response(channel.model_copy(update={"bandwidth_hz": corner_hz, **shape}), wave.turn)
 
     nominal = through(channel.bandwidth_hz)
+    nominal = np.where(np.abs(nominal) > _MIN_RESPONSE, nominal, np.inf)
     margin = min(len(one.values) // 8, round(_SETTLES_S / one.period_s))
     if len(one.values) - margin - round(_ENDS_S / one.period_s) < 2 * MIN_ROWS:
         return  # too short
@@ -177,18 +190,35 @@ def filtered(one: Shown) -> Iterator[Law]:
         y[: judged.start] = y[judged.stop :] = rms_of(y[judged])
         return y
 
-    def cost(log_hz: float) -> float:
-        settled = min(len(one.values) // 2, round(_SETTLING_PERIODS / math.exp(log_hz) / one.period_s))
-        return rms_of(residual_by(through(math.exp(log_hz)))[max(margin, settled) :])
+    def find_corner(shape: Mapping[str, Any], most_hz: float) -> float:
+        def cost(log_hz: float) -> float:
+            settled = min(len(one.values) // 2, round(_SETTLING_PERIODS / math.exp(log_hz) / one.period_s))
+            return rms_of(residual_by(through(math.exp(log_hz), shape))[max(margin, settled) :])
 
-    grid = np.log(np.geomspace(10.0, 0.98 * channel.bandwidth_hz, 40))
-    near, step = min(grid, key=cost), grid[1] - grid[0]
-    corner_hz = math.exp(least_at(cost, near - step, min(near + step, grid[-1])))
+        grid = np.log(np.geomspace(10.0, most_hz, 40))
+        near, step = min(grid, key=cost), grid[1] - grid[0]
+        return math.exp(least_at(cost, near - step, min(near + step, grid[-1])))
+
+    corner_hz = find_corner({}, 0.98 * channel.bandwidth_hz)
     margin = max(margin, min(len(one.values) // 2, round(_SETTLING_PERIODS / corner_hz / one.period_s)))
     residual, differs = residual_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
     if one.counts is None:
         delayed = (one.values - delayed_by(one)[1]) / one.floor
         passed = float((one.values - residual * one.floor).std())
+        most_hz = min(_MAX_CORNER_RATIO * channel.bandwidth_hz, 0.5 / one.period_s)
+        corners = {kind: find_corner(shape, most_hz) for kind, shape in _KINDS.items()}
+        fits = {kind: residual_by(through(hz, _KINDS[kind])) for kind, hz in corners.items()}
+        squares = {kind: float(fit @ fit) for kind, fit in fits.items()}
+        best = min(squares, key=lambda kind: squares[kind])
+        told = float(residual @ residual)
+        if squares[best] < told - one.price and rms_of(fits[best]) < _MAX_RATIO * rms_of(delayed):
+            alike = [
+                f"{kind} of {float(f'{corners[kind]:.3g}'):g} Hz" for kind in squares
+                if kind != best and squares[kind] < _KIND_TOLERANCE * squares[best] + MARGIN
+            ]  # fmt: skip
+            text = f"low-pass of kind {best} near {float(f'{corners[best]:.3g}'):g} Hz, told {channel.filter} of "
+            text += f"{channel.bandwidth_hz:g} Hz" + f" (not distinguished from {', '.join(alike)})" * bool(alike)
+            yield one.law("bandwidth", corners[best], fits[best], 2, text)
         # For a slow signal a low-pass is a delay; and a low-pass that passes nothing is not an explanation.
         if max(1.0, rms_of(residual)) < _MAX_RATIO * rms_of(delayed) and passed > _MIN_PASS * float(one.expected.std()):
             yield one.law("bandwidth", corner_hz, residual, 1, f"lower than given: {corner_hz:.3g} Hz")
