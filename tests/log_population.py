@@ -1,6 +1,6 @@
 """Logs of other laboratories by seed: names and units of many habits around signals of the second rig.
 
-The families in HELD_OUT were written before the tables of words, and are not a source for them.
+The families in HELD_OUT_NAMES were written before the tables of words, and are not a source for them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ KNOWN = {
     ),
     "short": "probe_dx|probe_dy|probe_rx|probe_ry|fN|fS|fE|fW|accInX|accInY|accOutX|accOutY|n|kph|hammer",
 }
-HELD_OUT = {
+HELD_OUT_NAMES = {
     "polish": (
         "Przem. tarczy X|Przem. tarczy Y|Przem. pierścienia X|Przem. pierścienia Y|Siła góra|Siła dół|Siła prawo|"
         "Siła lewo|Drgania obud. wewn. X|Drgania obud. wewn. Y|Drgania obud. zewn. X|Drgania obud. zewn. Y|Obroty|"
@@ -106,7 +106,7 @@ def simulate_motions(count: int) -> list[Motion]:
 
 def draw_log(motions: list[Motion], family: str, seed: int) -> Log:
     """Draw a log: rate, noise, offsets and units of its sensors, and the order and spelling of its signals."""
-    number = [*KNOWN, *HELD_OUT].index(family)
+    number = [*KNOWN, *HELD_OUT_NAMES].index(family)
     rng = np.random.default_rng([seed, number])
     rate_hz = float(rng.choice([5000.0, 10_000.0, 20_000.0, 25_600.0]))
     motion = motions[int(rng.integers(len(motions)))]
@@ -115,7 +115,7 @@ def draw_log(motions: list[Motion], family: str, seed: int) -> Log:
     )
     style = "missing" if family in BARE else _STYLES[(seed + number) % len(_STYLES)]
     choice = {kind: options[int(rng.integers(len(options)))] for kind, options in _SPELLINGS.items()}
-    names = dict(zip(CHANNELS, ({**KNOWN, **HELD_OUT}[family]).split("|"), strict=True))
+    names = dict(zip(CHANNELS, ({**KNOWN, **HELD_OUT_NAMES}[family]).split("|"), strict=True))
     order = list(CHANNELS)
     if family not in BARE or rng.random() < 0.5:
         rng.shuffle(order)

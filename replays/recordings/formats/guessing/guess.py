@@ -41,7 +41,7 @@ _PROBE_V = (-20.0, -1.0)
 """Mean voltages of eddy-current probes: supplied with -24 V, mid-range is about -10 V."""
 _PAIRS = {"length": ("disk", "ring"), "acceleration": ("inner", "outer")}
 _AXIS_OF_SIDE = {"N": "y", "S": "y", "E": "x", "W": "x"}
-_STEADY = 0.1
+_MAX_SPEED_VARIATION = 0.1
 """Largest standard deviation of a speed, relative to its mean."""
 _PLAUSIBLE = {
     "disk": ("mm", 5e-3, 3.0), "ring": ("mm", 5e-3, 1.5), "P": ("N", 100.0, 50_000.0), "hammer": ("N", 1.0, 20_000.0),
@@ -287,7 +287,7 @@ def _score_waves(
             "speed": -1.0,
         }
     wave["hammer"] = -1.0
-    steady = view.spread < _STEADY * abs(view.mean)
+    steady = view.spread < _MAX_SPEED_VARIATION * abs(view.mean)
     opposed = min((relations.opposed(number, other) for other in every if other != number), default=0.0)
     turning = [
         other
@@ -386,7 +386,7 @@ def _explain_pairs(guesses: Sequence[Guess], relations: Relations, own: set[int]
 
 
 def _choose_zeros(guesses: Sequence[Guess]) -> None:
-    """Propose the mean as zero of both probes of a pair, or of neither."""
+    """Set the mean as zero of both probes of a pair, or of neither."""
     for place in _PAIRS["length"]:
         pair = [each for each in guesses if each.channel in (f"{place}_x", f"{place}_y") and not each.volts]
         if any(abs(each.features.mean) > 5.0 * each.features.spread for each in pair):
@@ -461,7 +461,7 @@ def _scale(each: Guess, unit: str, usual_v: float) -> None:
 
 
 def _check_unit(each: Guess, unit: str) -> None:
-    """Propose a unit for a signal without a known one, by its size; ask if the size is implausible."""
+    """Choose a unit for a signal without a known one, by its size; ask if the size is implausible."""
     wanted, low, high = _PLAUSIBLE[each.channel.partition("_")[0]]
     extent = each.features.extent
     peak = max(abs(value - each.features.median) for value in extent)
