@@ -143,6 +143,16 @@ def test_another_kind_of_low_pass_than_told_is_named(kind: str) -> None:
     ), laws
 
 
+def test_floated_friction_of_a_log_is_fitted_and_the_rest_is_judged_with_it(mils: Recording) -> None:
+    found = validate(
+        mils, criteria=load_criteria().with_floating(["contact.friction"]), changes={"contact.friction": 0.22}
+    )
+    entry = found.document()["floated"]["contact.friction"]
+    assert found.good, found.verdict_line
+    assert abs(entry["value"] - 0.25) < entry["half_width"] < 0.01
+    assert found.verdict_line.endswith("; fitted, and not judged: contact.friction")
+
+
 @MATRIX
 @pytest.mark.parametrize("kind", ["bessel", "sinc"])
 def test_another_low_pass_in_a_log_is_named_with_kinds_like_it(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -27,6 +28,7 @@ from rig.base.wire import EDGES, EVENTS, encode_block, encode_document, sensor_k
 from rig.run.offline import frames
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
+from tests.commands import run_captured
 
 RUN_CHANGES = {"sensors.rate_hz": 2000, "sensors.truth_rate_hz": 100, "duration_s": 0.06}
 
@@ -400,3 +402,33 @@ def test_a_document_is_json_throughout(hammer: Recording) -> None:
     assert document["good"] is False
     assert document["explained"]["best"] == ["contact.restitution"]
     assert outcome.Validation is type(found)
+
+
+# Numbers that float.
+
+
+def test_floated_numbers_are_fitted_to_a_recording_of_the_rig_and_not_judged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = record_scene(tmp_path / "other.mcap", duration_s=0.15, sensors__rate_hz=10_000, contact__friction=0.22).path
+    arguments = ("validate", str(path), "--set", "contact.friction=0.25", "--float", "contact.friction", "--json")
+    code, out, _ = run_captured(capsys, *arguments)
+    floated = json.loads(out)["floated"]["contact.friction"]
+    assert code == 0
+    assert abs(floated["value"] - 0.22) < floated["half_width"] < 1e-3
+    code, _, text = run_captured(capsys, *arguments[:-2], "contact.frictoin")
+    assert (code, "contact.friction" in text) == (2, True)
+
+
+def test_a_number_that_a_recording_does_not_determine_is_no_pass(tmp_path: Path) -> None:
+    free = record_scene(tmp_path / "free.mcap", duration_s=0.02)
+    found = validate(free, criteria=make_criteria().with_floating(["contact.restitution"]))
+    assert found.outcome is Outcome.INCONCLUSIVE
+    assert "does not determine contact.restitution" in found.verdict_line
+
+
+def test_a_floated_number_is_no_candidate_for_a_cause() -> None:
+    rules = load_criteria().with_floating(["house.pair_stiffness_vertical"])
+    names = {one.name for one in rules.attribution.candidates}
+    assert not names & {"house.pair_stiffness", "house.pair_stiffness_vertical"}
+    assert "house.pair_stiffness_horizontal" in names

@@ -31,7 +31,15 @@ from replays.recordings.identification.agreement import (
 from replays.recordings.identification.request import first_command_s, fit_unit, observe
 from replays.recordings.resimulation.experiment import PICKUP_S, Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction
-from replays.recordings.resimulation.sensitivity import ANGLE, STATE, Predictor, get_value, to_model_clock, with_values
+from replays.recordings.resimulation.sensitivity import (
+    ANGLE,
+    STATE,
+    Predictor,
+    get_scale,
+    get_value,
+    to_model_clock,
+    with_values,
+)
 from rig.base.errors import InputError, Words
 from rig.run.simulation import TICK_RATE_HZ
 
@@ -94,6 +102,13 @@ class Fitted:
     half_width: float
     prior: tuple[float, float] | None = None
     """Mean and standard deviation of the prior."""
+    scale: float = math.inf
+    """Size of a unit change; an interval this wide contains no information."""
+
+    @property
+    def is_determined(self) -> bool:
+        """True if the samples or a prior determine the value."""
+        return self.prior is not None or self.half_width < 0.5 * self.scale
 
     @property
     def beyond(self) -> bool:
@@ -284,7 +299,7 @@ def tune(
     experiment: Experiment,
     keys: Sequence[str] = NUISANCES,
     *,
-    priors: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, tuple[float, float] | None] | None = None,
     channels: Sequence[str] | None = None,
     to_s: float | None = None,
     late_s: Mapping[str, float] | None = None,
@@ -299,7 +314,7 @@ def tune(
         recording: The log.
         experiment: Experiment, as far as it is known.
         keys: Keys to fit.
-        priors: Additional priors: means and standard deviations.
+        priors: Additional keys and their priors: means and standard deviations; None fits a key without a prior.
         channels: Channels to use; None for all.
         to_s: End of the used samples [s].
         late_s: Assumed delay of some channels [s].
@@ -338,7 +353,7 @@ def tune(
         baseline=baseline,
         experiment=with_values(baseline, fitted),
         fitted=tuple(
-            Fitted(key, get_value(experiment, key), value, width, wanted[key])
+            Fitted(key, get_value(experiment, key), value, width, wanted[key], get_scale(baseline, key))
             for (key, value), width in zip(fitted.items(), np.minimum(half, prior_widths).tolist(), strict=True)
         ),
         values=fitted,

@@ -12,8 +12,8 @@ import numpy as np
 
 from recorder.contents.consistency import calibration_off
 from recorder.reader import Recording
-from replays.recordings.identification.nuisance import Tuned, tune, window_start_s
-from replays.recordings.identification.request import first_command_s
+from replays.recordings.identification.nuisance import Fitted, Tuned, tune, window_start_s
+from replays.recordings.identification.request import ask, first_command_s
 from replays.recordings.parameters import parameter_doubts
 from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured, simplify
@@ -70,6 +70,8 @@ def validate(
     experiment = Experiment.from_recording(recording)
     if changes:
         experiment = experiment.with_changes(changes)
+    if criteria.floating:
+        ask(recording, experiment, criteria.floating)  # reports a wrong key before the long fit
     recording = recording.without_faults() if blind else recording.with_true_blocks()
     if blind:
         experiment = experiment.without_faults()
@@ -77,7 +79,8 @@ def validate(
     begin, end, reason = _window(again)
     trajectory = residuals(again.parts, again.nominal, again.others, again.criteria, end_s=end)
     tables = recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
-    truth = judge_truth(tables, again.nominal, again.others[0], criteria, end_s=end)
+    # Noise limits a fitted number, but not the truth.
+    truth = [] if criteria.floating else judge_truth(tables, again.nominal, again.others[0], criteria, end_s=end)
     doubts = [*recording.doubts, *parameter_doubts(recording)]
     lost = missing_rows(recording) if blind else {}
     doubts += [f"{rows} of {due} rows of {key} are missing" for key, (rows, due) in lost.items()]
@@ -106,7 +109,7 @@ def validate(
         skipped=sum(rows for rows, _ in lost.values())
         or sum(one.skipped for one in again.bits.values())
         or sum(stream.lost - stream.declared for stream in recording.streams.values()),
-        explained=None, fitted=again.tuned.fitted if again.tuned is not None else (),
+        explained=None, fitted=again.fitted, floating=criteria.floating,
         parts=again.parts, nominal=again.nominal, files=len(recording.parts), **_contact(again, phases, end),
         doubts=tuple(doubts), faults=again.faults, complete=recording.complete,
     )  # fmt: skip
@@ -186,6 +189,7 @@ class _Resimulation:
         others: Equally valid predictions: of another build, or of other fits and models.
         bits: Comparison of bits by key; empty for an imported log.
         tuned: Fit of an imported log.
+        fitted: Fitted numbers, of any recording.
         faults: Faults that the signals of an imported log show without a model.
         members: Ensemble of an imported log: equally good fits of equally valid models; otherwise made from `quick`.
         unjudged: Groups of a log whose noise cannot be judged, as too few rows precede the hammer pulse.
@@ -200,6 +204,7 @@ class _Resimulation:
     others: tuple[Prediction, ...]
     bits: dict[str, StreamBits]
     tuned: Tuned | None
+    fitted: tuple[Fitted, ...] = ()
     members: tuple[Prediction, ...] = ()
     faults: tuple[SignalFault, ...] = ()
     unjudged: tuple[str, ...] = ()
@@ -216,6 +221,11 @@ def _resimulate(
     rules = criteria.window
     parts = read_measured(recording, experiment.scene, longest_s=rules.longest_s)
     bits = Bits(recording, experiment.simulation().table)
+    floated = None
+    if criteria.floating:
+        priors = dict.fromkeys(criteria.floating)
+        floated = tune(recording, experiment, (), priors=priors, progress=lambda text: step(f"fit: {text}"))
+        experiment = floated.experiment
     step("re-simulated, payload by payload")
     # Only the bits of channels with injected faults are compared: the prediction has no faults.
     sound = {name: [one for one in part.names if one not in experiment.faulty_channels] for name, part in parts.items()}
@@ -223,7 +233,9 @@ def _resimulate(
     nominal = predict(experiment, parts, follow=bits.follow)
     quick = simplify(experiment)
     step("perturbed, to find the predictable part")
-    moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
+    others = [predict(perturbed(quick, rules.parameters, rules.perturbation), parts)]
+    determined = floated is not None and all(one.is_determined for one in floated.fitted)
+    members = _draw_predictions([floated], parts, criteria) if floated is not None and determined else ()
     streams = bits.finish()
     truth = [one.equal for key, one in streams.items() if key.startswith(TRUTH)]
     same = all(truth) and (bool(truth) or experiment.scene.generator is not None)
@@ -231,14 +243,27 @@ def _resimulate(
     off = {name for part in parts for name in bits.channels_off(part)}
     own: list[Explanation] = []
     if (
-        not all(one.equal for one in streams.values())
+        floated is None
+        and not all(one.equal for one in streams.values())
         and all(truth)
         and len(off) < (len(names) if same else FEW_CHANNELS * len(names))
     ):
         own = own_faults(
             parts, nominal, bits.differences, recording.edges(), bits.edges_s(), partial(predict, experiment), step
         )  # fmt: skip
-    return _Resimulation(quick, criteria, parts, nominal, (moved,), streams, None, own=tuple(own), same_motion=same)
+    return _Resimulation(
+        quick, criteria, parts, nominal, (*others, *members), streams, None, floated.fitted if floated else (), members,
+        own=tuple(own), same_motion=same,
+    )  # fmt: skip
+
+
+def _draw_predictions(
+    models: Sequence[Tuned], parts: dict[str, Measured], criteria: Criteria
+) -> tuple[Prediction, ...]:
+    """Return the ensemble of fits of equally valid models, with values drawn from their uncertainty."""
+    generator = np.random.default_rng(0)  # the same in every validation
+    drawn = [models[n % len(models)].draw_values(generator) for n in range(criteria.ensemble.members)]
+    return tuple(one.predict(parts) for one in drawn)
 
 
 def _resimulate_log(
@@ -250,7 +275,10 @@ def _resimulate_log(
 ) -> _Resimulation:
     """Return the re-simulation of a log: unknown numbers are fitted, and their uncertainty is added to the floor."""
     rules = criteria.imported
-    tuned = tune(recording, experiment, rules.nuisances, late_s=late_s, progress=lambda text: step(f"log: {text}"))
+    tuned = tune(
+        recording, experiment, rules.nuisances, priors=dict.fromkeys(criteria.floating), late_s=late_s,
+        progress=lambda text: step(f"log: {text}"),
+    )  # fmt: skip
     whole, longest_s = read_measured(recording, tuned.baseline.scene), criteria.window.longest_s
     begin_s = window_start_s(tuned.baseline)
     parts = {
@@ -258,7 +286,6 @@ def _resimulate_log(
     }
     nominal = tuned.predict(parts)
     step("perturbed, and with equally valid models, to find the predictable part")
-    generator = np.random.default_rng(0)  # the same in every validation
     others = [tuned.undo_last_growth().predict(parts)]
     models = [tuned, *(tuned.with_changes(variant.set) for variant in rules.variants)]
     others += [model.predict(parts) for model in models[1:]]
@@ -269,7 +296,6 @@ def _resimulate_log(
     if np.count_nonzero(recording.edges() < until_s) < 2:
         # The phase of the pulses is unknown: a pulse is possible at any time.
         others.insert(1, _replace_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
-    drawn = [models[n % len(models)].draw_values(generator) for n in range(criteria.ensemble.members)]
     faults = signal_faults(whole, until_s)
     key = next((name for name, part in whole.items() if "keyphasor" in part.names), min(whole))
     mapped = "keyphasor" in recording.scene["import"]["mapping"]
@@ -278,7 +304,7 @@ def _resimulate_log(
         from_s=float(whole[key].times_s[0]) if mapped else math.inf, period_s=1.0 / whole[key].channels[0].rate_hz,
     )  # fmt: skip
     return _Resimulation(
-        faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
+        faults=tuple(faults), members=_draw_predictions(models, parts, criteria), fitted=tuned.fitted,
         unjudged=tuple(name for name, part in whole.items() if not is_quiet(part, until_s)),
         quick=simplify(tuned.experiment), criteria=criteria.for_log(),
         parts=tuned.to_model_clock(parts),
@@ -305,6 +331,7 @@ def _window(again: _Resimulation) -> tuple[float, float, str]:
         return begin, end, "as far as fit and model agree" if end == again.tuned.end_s else "models differ from there"
     parted = foreseeable_s(parts, again.nominal, again.others, share=rules.share)
     change = f"a change of {rules.perturbation:g}"
+    change += ", or of the fitted numbers by their uncertainty," * bool(again.fitted)
     if parted is None:
         end = max(float(part.times_s[-1]) for part in parts.values()) + 1e-9
         return begin, end, f"to the end: {change} stays below {rules.share:g} of every channel's noise"

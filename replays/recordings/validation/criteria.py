@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
@@ -174,6 +175,14 @@ class Criteria(_Section):
     statistics: tuple[StatisticCriterion, ...]
     attribution: Attribution
     imported: Imported
+    floating: tuple[str, ...] = ()
+    """Numbers that are fitted without a prior before anything is compared, and are not judged."""
+
+    def with_floating(self, keys: Sequence[str]) -> Criteria:
+        """Return the criteria with numbers that are fitted first and not judged."""
+        named = tuple(one for one in self.attribution.candidates if not set(one.keys) & set(keys))
+        attribution = self.attribution.model_copy(update={"candidates": named})
+        return self.model_copy(update={"floating": tuple(dict.fromkeys(keys)), "attribution": attribution})
 
     def for_log(self) -> Criteria:
         """Return the criteria for a log: wider by the uncertainty of its noise and of equally valid models."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.identification.nuisance import Fitted
+from replays.recordings.identification.request import fit_unit
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.bits import StreamBits
 from replays.recordings.validation.explanations.attribution import Explained
@@ -74,6 +75,7 @@ class Validation:
         fitted: Numbers fitted before the comparison, as an imported log does not state them exactly.
         parts: Recorded channels.
         nominal: Prediction.
+        floating: Keys of the fitted numbers that have no prior and are not judged, on request.
         files: Number of files of the recording.
         faults: Faults that a log's signals show without a model.
         doubts: Inconsistencies within the recording; with any of them the validation fails.
@@ -101,6 +103,7 @@ class Validation:
     fitted: tuple[Fitted, ...] = ()
     parts: dict[str, Measured] = field(repr=False, default_factory=dict)
     nominal: Prediction | None = field(repr=False, default=None)
+    floating: tuple[str, ...] = ()
     files: int = 1
     faults: tuple[SignalFault, ...] = ()
     doubts: tuple[str, ...] = ()
@@ -129,6 +132,9 @@ class Validation:
         """Return the reason why too little was compared for a pass; empty if enough was."""
         if not self.complete:
             return "the recording is not complete, by an unknown number of rows; the existing rows pass"
+        unknown = [one.key for one in self.fitted if one.key in self.floating and not one.is_determined]
+        if unknown:
+            return f"the recording does not determine {', '.join(unknown)}; the rest passes"
         if self.bit_exact and not self.declared:
             rows = sum(one.rows for one in self.bits.values())
             if rows < _MIN_JUDGED * (rows + self.skipped):
@@ -218,7 +224,8 @@ class Validation:
         if self.outcome is Outcome.PASS:
             basis = "bit by bit" if self.bit_exact and not self.declared else f"by the criteria: {self.criteria}"
             unseen = "; no contact was compared sample by sample" if self.contact_s is not None else ""
-            return f"pass, {basis}{unseen}"
+            floated = f"; fitted, and not judged: {', '.join(self.floating)}" if self.floating else ""
+            return f"pass, {basis}{unseen}{floated}"
         if self.doubts:
             more = f", and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
             return f"fail, the recording is inconsistent: {self.doubts[0]}{more}"
@@ -262,6 +269,11 @@ class Validation:
                     for one in self.faults
                 ],
                 "fitted": [one.line for one in self.fitted],
+                "floated": {
+                    one.key: {"value": one.value, "half_width": one.half_width, "unit": fit_unit(one.key)}
+                    for one in self.fitted
+                    if one.key in self.floating
+                },
                 "calibration": list(self.calibration),
                 "window": {"from_s": self.window_s[0], "to_s": self.window_s[1], "reason": self.window_reason},
                 "trajectory": [asdict(one) for one in self.residuals],

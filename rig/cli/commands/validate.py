@@ -14,7 +14,7 @@ import typer
 
 from rig.base.errors import InputError, SimulationError, Words
 from rig.base.outcome import Outcome
-from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges
+from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges, split_names
 from rig.cli.output.progress import reporting
 from rig.cli.output.provenance import recording_origin
 from rig.cli.output.tables import Form, Table, echo, echo_json, make_printable, new_table
@@ -39,6 +39,9 @@ def validate(
     ] = None,
     changes: Changes = None,
     engine: Engine = None,
+    floating: Annotated[
+        str | None, typer.Option("--float", metavar="KEY,...", help="Fit these numbers first, and judge the rest")
+    ] = None,
     declared: Annotated[
         bool, typer.Option("--declared", help="Apply the declared criteria even if every bit is equal")
     ] = False,
@@ -67,6 +70,7 @@ def validate(
     if report is not None:
         check_report(report, force=force)
     rules = load_criteria(criteria)
+    rules = rules.with_floating((*rules.floating, *split_names(floating)))
     texts = SceneChanges(changes=changes, engine=engine).overrides()
     overrides = {key: read_value(value) for key, value in texts.items()}
     options: dict[str, Any] = {"criteria": rules, "changes": overrides, "declared": declared, "blind": blind}
