@@ -73,6 +73,38 @@ HELD_OUT_NAMES = {
     "bare": "|".join(f"CH{n}" for n in range(1, 16)),
     "wav": "|".join(f"channel {n}" for n in range(1, 16)),
     "none": "|".join(f"column {n}" for n in range(2, 17)),
+    "czech": (
+        "Výchylka disku X|Výchylka disku Y|Výchylka kroužku X|Výchylka kroužku Y|Síla nahoře|Síla dole|"
+        "Síla vpravo|Síla vlevo|Zrychlení vnitřní těleso X|Zrychlení vnitřní těleso Y|Zrychlení vnější těleso X|"
+        "Zrychlení vnější těleso Y|Otáčky|Fázová značka|Rázové kladívko"
+    ),
+    "swedish": (
+        "Läge skiva horis.|Läge skiva vert.|Läge ring horis.|Läge ring vert.|Kraft upp|Kraft ner|Kraft höger|"
+        "Kraft vänster|Acc innerhus X|Acc innerhus Y|Acc ytterhus X|Acc ytterhus Y|Varvtal|Varvpuls|Slaghammare"
+    ),
+    "turkish": (
+        "Disk yer değ. yatay|Disk yer değ. düşey|Halka yer değ. yatay|Halka yer değ. düşey|Kuvvet üst|Kuvvet alt|"
+        "Kuvvet sağ|Kuvvet sol|İvme iç gövde yatay|İvme iç gövde düşey|İvme dış gövde yatay|İvme dış gövde düşey|"
+        "Devir|Faz referansı|Darbe çekici"
+    ),
+    "catman": (
+        "Wegaufnehmer 1 (Scheibe X)|Wegaufnehmer 2 (Scheibe Y)|Wegaufnehmer 3 (Fangring X)|"
+        "Wegaufnehmer 4 (Fangring Y)|KMD N|KMD S|KMD O|KMD W|Beschl_Innenring_X|Beschl_Innenring_Y|"
+        "Beschl_Aussenring_X|Beschl_Aussenring_Y|Drehzahl_n|Nulllage|Impulshammer_F"
+    ),
+    "mts": (
+        "Rotor Disp Lat|Rotor Disp Vert|Catcher Disp Lat|Catcher Disp Vert|LC1 Top|LC2 Bottom|LC3 Right|LC4 Left|"
+        "Accel1 InnerFrame Lat|Accel2 InnerFrame Vert|Accel3 OuterFrame Lat|Accel4 OuterFrame Vert|Shaft RPM|"
+        "Index|Modal Hammer"
+    ),
+    "dewesoft": (
+        "AI 1;Rotor X|AI 2;Rotor Y|AI 3;Ring X|AI 4;Ring Y|AI 5;F top|AI 6;F bottom|AI 7;F right|AI 8;F left|"
+        "AI 9;Inner X|AI 10;Inner Y|AI 11;Outer X|AI 12;Outer Y|CNT 1;Frequency|DI 1;Tacho|AI 13;Impact"
+    ),
+    "famos": (
+        "Weg_Sch_X|Weg_Sch_Y|Weg_Ri_X|Weg_Ri_Y|Kraft_N|Kraft_S|Kraft_O|Kraft_W|a_IG_x|a_IG_y|a_AG_x|a_AG_y|"
+        "n_Welle|Trigger_n|F_Hammer"
+    ),
 }
 BARE = ("bare", "wav", "none")
 _MAP = dict(zip(CHANNELS, _KINDS, strict=True))

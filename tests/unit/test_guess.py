@@ -51,6 +51,11 @@ from tests.commands import run_captured, run_for_output
         ("Impulshammer", "hammer", "", "", ""),
         ("oil temperature", "", "", "", ""),
         ("AI0", "", "", "", ""),
+        ("F12h", "force", "", "", "N"),
+        ("Prox 3h Disk", "length", "disk", "", "E"),
+        ("Kraft 9 Uhr", "force", "", "", "W"),
+        ("load 6 o'clock", "force", "", "", "S"),
+        ("Accel 3 H", "acceleration", "", "x", ""),
     ],
 )
 def test_names_in_many_languages(name: str, kind: str, place: str, axis: str, side: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import re
@@ -19,6 +20,7 @@ from replays.report import write_report
 from replays.report.document import Heading, Paragraph, Picture, Report, Table
 from replays.studies.paper.claim import CORRECTIONS, Bar, bars, claim_groups, correction_keys, select_lower_ends
 from replays.studies.paper.document import typeset, write_up
+from replays.studies.paper.figures.chart import draw_verdicts
 from replays.studies.paper.figures.figure import first_impacts
 from replays.studies.paper.findings import Findings, find, list_groups, steps
 from replays.studies.paper.scans.pulse import PULSE_AT, Pulse, PulseRun, outcome, outcomes
@@ -31,7 +33,16 @@ from replays.studies.paper.scans.spread import (
     phases,
     rank_correlation,
 )
-from replays.studies.paper.statement import SETS, Statement, claims, distribution, number, printed_values, statements
+from replays.studies.paper.statement import (
+    MIN_RUNS,
+    SETS,
+    Statement,
+    claims,
+    distribution,
+    number,
+    printed_values,
+    statements,
+)
 from rig.cli.main import main
 from rig.physics.parameters import load_parameters
 from tests.commands import run_for_output
@@ -106,7 +117,8 @@ def test_statements_name_their_source_and_agreement():
     ("value", "verdict"), [(1.0, "agrees"), (2.0, "agrees"), (2.1, "differs"), (0.9, "differs"), (math.nan, "differs")]
 )
 def test_verdict_of_a_number(value, verdict):
-    assert statement(low=1.0, high=2.0).verdict(np.array([value])) == verdict
+    assert statement(low=1.0, high=2.0).verdict(np.full(MIN_RUNS, value)) == verdict
+    assert statement(low=1.0, high=2.0).verdict(np.full(MIN_RUNS - 1, value)) == "cannot be judged"
 
 
 @pytest.mark.parametrize(
@@ -118,14 +130,54 @@ def test_verdict_of_a_share_inside(inside, verdict):
     assert statement(low=1.0, high=2.0).verdict(values) == verdict
 
 
+@pytest.mark.parametrize(
+    ("inside", "count", "fields", "shown"),
+    [
+        (19, 20, {}, "95%, 76% to 99% (20)"), (8, 8, {}, "100%, 68% to 100% (8)"), (0, 16, {}, "0%, 0% to 19% (16)"),
+        (2, 2, {}, "too few (2)"), (16, 16, {"readings": 2}, "100%, 68% to 100% (8, 2 readings)"),
+        (8, 8, {"readings": 2}, "too few (4, 2 readings)"), (0, 5, {"listed": True}, "0 of 5 cases"),
+    ],
+)  # fmt: skip
+def test_a_share_has_the_bounds_of_its_runs_or_says_too_few(inside, count, fields, shown):
+    from scipy.stats import binomtest
+
+    entry, values = statement(low=1.0, high=2.0, **fields), np.repeat([1.5, 3.0], [inside, count - inside])
+    assert entry.format_share(values) == shown
+    if math.isfinite(entry.bounds(values)[0]):
+        runs = count // entry.readings
+        expected = binomtest(inside // entry.readings, runs).proportion_ci(method="wilson")
+        assert entry.bounds(values) == pytest.approx(tuple(expected), abs=1e-6)
+
+
+CONTRADICTIONS = {
+    "drop_span": 0.3, "drop_settled": 250.0, "drop_bounces": 1.0, "drop_reaction": 1000.0, "drop_acceleration": 500.0,
+    "drop_sensed": 500.0, "drop_sensed_acceleration": 500.0, "drop_amplified": 0.7, "backward": 0.0, "lasts": 0.0,
+    "orbit_ring": 0.3, "orbit_disk": 0.5, "whirl_hz": 80.0, "whirl_per_spin": 13.0, "imbalance": 3.0,
+    "peak_x": 1000.0, "peak_y": 1000.0, "peak_sensed": 1500.0, "steady": 10.0, "east": 300.0, "bouncing": 1.3,
+    "slowest_whirls": 0.0, "period_ratio": 1.0, "impulsive_ratio": 0.9, "house_raises": 0.95, "house_ripple": 0.9,
+    "stiff_bouncing": 0.8, "stiff_force": 0.8, "law_whirl": 1.02, "law_peak": 2.0,
+}  # fmt: skip
+"""A possible result for each judged statement that contradicts it. A whirl at a natural frequency has an equal period
+at any speed; a rigid ring has a ripple by unequal damping; times and ratios above 0 need no test."""
+
+
+def test_every_judged_statement_can_be_contradicted_by_a_possible_result():
+    judged = {entry.quantity: entry for entry in (*statements(), *claims()) if math.isfinite(entry.low)}
+    assert set(judged) == set(CONTRADICTIONS)
+    for name, value in CONTRADICTIONS.items():
+        assert value > 0.0 or judged[name].low == judged[name].high == 1.0, "no motion has it"
+        assert judged[name].verdict(np.full(100, value)) == "differs", name
+
+
 def test_verdict_without_data():
     assert statement(why="no axis").verdict(np.array([1.0])) == "cannot be judged"
 
 
 @pytest.mark.parametrize(
     ("values", "shown"),
-    [([1.0, 1.0], "1"), ([1.1111, 1.1112], "1.111"), ([538.6], "538.6"), ([1000.0, 2084.0, 3000.0], "2080 (1110–2910)"),
-     ([1.049, 1.6, 2.38], "1.60 (1.10–2.30)"), ([13.19, 13.4, 13.47], "13.40 (13.21–13.46)"), ([math.nan], "none")],
+    [([1.0, 1.0], "1"), ([1.1111, 1.1112], "1.111"), ([538.6], "538.6"), ([1000.0, 2084.0, 3000.0], "2080 (1000–3000)"),
+     ([1.049, 1.6, 2.38], "1.60 (1.05–2.38)"), ([13.19, 13.4, 13.47], "13.40 (13.19–13.47)"),
+     (list(range(1, 102)), "51.0 (6.0–96.0)"), ([math.nan], "none")],
 )  # fmt: skip
 def test_distribution_is_printed_with_its_significant_figures(values, shown):
     assert distribution(np.array(values)) == shown
@@ -194,8 +246,12 @@ def test_quick_variant_has_a_number_on_every_line(findings: Findings, progress: 
     spread = {line.statement.quantity: len(line.values["corrected"]) for line in findings.lines}
     assert spread["peak_x"] == len(findings.spread), "all assumed values at once"
     assert spread["orbit_ring"] == 2 * spread["orbit_disk"], "in the ring or at the disk"
+    runs = {line.statement.quantity: line.statement.count_runs(line.values["corrected"]) for line in findings.lines}
+    assert runs["orbit_ring"] == spread["orbit_disk"]
+    assert runs["drop_amplified"] == runs["drop_reaction"] == 4
     claims_of = {line.statement.quantity: line.values["corrected"] for line in findings.claims}
     few = len(findings.results["spread rigid"])
+    assert {line.statement.count_runs(line.values["corrected"]) for line in findings.claims[:4]} == {few}
     assert len(claims_of["stiff_force"]) == 3 * 3 * few > 9, "three housings and three readings of each sample"
     assert len(claims_of["house_raises"]) == few
     assert spread["drop_amplified"] == 2 * spread["drop_reaction"] > 2, "two readings of each sample"
@@ -214,6 +270,14 @@ def report(findings: Findings) -> Iterator[Report]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Report, "picture", small)
         yield write_up(findings, quick=True)
+
+
+def test_labels_of_the_statements_are_whole_and_apart(findings: Findings):
+    figure = draw_verdicts([*findings.lines, *findings.claims])
+    figure.canvas.draw()
+    boxes = [label.get_window_extent() for label in figure.axes[0].get_yticklabels()]
+    assert min(box.x0 for box in boxes) >= 0.0
+    assert all(above.y0 >= below.y1 for above, below in itertools.pairwise(boxes))
 
 
 def test_report_backs_every_section_with_a_table(report: Report, tmp_path: Path):

@@ -10,7 +10,7 @@ import numpy as np
 
 from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, add_legend, house_style, new_figure
 from replays.studies.paper.scans.pulse import BANDWIDTH, MEASURED_N, Pulse, PulseRun
-from replays.studies.paper.scans.spread import column, free_values, one_at_a_time, phases, rank_correlation
+from replays.studies.paper.scans.spread import column, free_values, one_at_a_time, percentiles, phases, rank_correlation
 from rig.physics.parameters import load_parameters
 
 if TYPE_CHECKING:
@@ -174,9 +174,9 @@ def draw_tornado(results: Results, spread: list[PulseRun]) -> Figure:
         values = column(spread, quantity)
         values = values[np.isfinite(values)]
         if len(values):
-            low, middle, high = np.percentile(values, [5, 50, 95])
-            text_5_95 = f"all assumed values varied:\n{low:.0f} to {high:.0f} N (5 to 95 %)"
-            axes.axvspan(low, high, color="0.93", zorder=0, label=text_5_95)
+            low, middle, high = percentiles(values)
+            varied = f"all assumed values varied,\n{len(values)} runs: {low:.0f} to {high:.0f} N"
+            axes.axvspan(low, high, color="0.93", zorder=0, label=varied)
             axes.axvline(middle, color="0.6", lw=1.0, zorder=0)
         axes.axvline(median(results["base corrected"], quantity), color=BLACK, lw=1.2, label="corrected")
         axes.axvline(median(results["base as-printed"], quantity), color=BLUE, lw=1.4, ls=":", label="as-printed")

@@ -42,7 +42,7 @@ from replays.studies.paper.scans.spread import (
     percentiles,
     rank_correlation,
 )
-from replays.studies.paper.statement import number
+from replays.studies.paper.statement import MIN_RUNS, number, wilson_bounds
 from rig.physics.parameters import load_parameters
 
 if TYPE_CHECKING:
@@ -165,6 +165,7 @@ def _numbers(findings: Findings) -> dict[str, Any]:
     results, reproductions = findings.results, findings.runs_by_set
     return {
         "judged_by": JUDGED_BY,
+        "min_runs": MIN_RUNS,
         "runs_by_set": reproductions,
         "median": lambda group, quantity: median(results[group], quantity),
         "measured_n": MEASURED_N,
@@ -199,6 +200,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
 
     reached = select_lower_ends(bars(results, "reaction_x_n"))
     whirling = [result for result in findings.spread if result.whirls]
+    share = float(np.mean([result.reaction_x_n <= MEASURED_N for result in whirling])) if whirling else math.nan
     ranks = np.nan_to_num(rank_correlation(findings.parts, column(findings.spread, "reaction_x_n")))
     first = int(np.argmax(np.abs(ranks)))
     low_passes = zip(BANDWIDTHS_HZ, results["bandwidth"], strict=True)
@@ -214,7 +216,8 @@ def _moves(findings: Findings) -> dict[str, Any]:
         },
         "corners_hz": [hz for hz, result in low_passes if result.reaction_x_n <= MEASURED_N],
         "whirling": len(whirling),
-        "share": float(np.mean([result.reaction_x_n <= MEASURED_N for result in whirling])) if whirling else math.nan,
+        "share": share,
+        "bounds": wilson_bounds(share, max(1, len(whirling))),
         "first": {"called": free_values()[first].called, "rank": ranks[first]},
     }
 

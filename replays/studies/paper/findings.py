@@ -21,7 +21,7 @@ from replays.studies.paper.scans import condition
 from replays.studies.paper.scans.condition import Slip, Start, Threshold
 from replays.studies.paper.scans.pulse import HAMMER_MS, Pulse, PulseRun, outcomes, pulse_model
 from replays.studies.paper.scans.spread import column, hypercube, phases
-from replays.studies.paper.statement import SETS, Statement, claims, distribution, statements
+from replays.studies.paper.statement import MIN_RUNS, SETS, Statement, claims, distribution, statements
 from rig.physics.kernels.constants import Constants
 from rig.physics.levels import ModelLevels
 from rig.physics.model import build_model
@@ -53,12 +53,11 @@ class Line:
     def row(self) -> Row:
         """Return the line as a table row, with the verdict on the corrected rig."""
         entry, best = self.statement, SETS[-1]
-        share = entry.inside(self.values[best])
         ours = [distribution(self.values[name]) if name in self.values else "–" for name in SETS]
         cells = (entry.says, entry.place, entry.paper, "" if entry.unit == "1" else entry.unit, *ours)
-        inside = f"{share:.0%} ({len(self.values[best])})" if math.isfinite(share) else "–"
-        verdict = self.verdicts[best]
-        return Row((*cells, inside, f"{verdict}: {entry.why}" if entry.why else verdict), MARKS[verdict])
+        verdict, values = self.verdicts[best], self.values[best]
+        why = entry.why or ("too few runs" if entry.is_short(values) else "")
+        return Row((*cells, entry.format_share(values), f"{verdict}: {why}" if why else verdict), MARKS[verdict])
 
 
 @dataclass
@@ -96,8 +95,8 @@ class Findings:
 
 JUDGED_BY = (
     "a result agrees if at least 95 % of it lies in the range that the paper states, differs if at most 5 % does, and "
-    "cannot be judged otherwise; assumed: a curve fills more than 2/5 of the labelled range of its axis and ends "
-    "before the next label would be, and a number in the text is accurate to 1 %"
+    f"cannot be judged otherwise, or from fewer than {MIN_RUNS} runs; assumed: a curve fills more than 2/5 of the "
+    "labelled range of its axis and ends before the next label would be, and a number in the text is accurate to 1 %"
 )
 """Criterion of agreement, in a line."""
 LENGTHS_MS = (4.0, 5.0, 6.0)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from replays.studies.common.closed_forms import Impact, impact, stiffest_mode
 from replays.studies.paper.claim import Groups, Results, median
-from replays.studies.paper.reproduction import G, Reproduction, bare_drop, drop_impact, drop_impulse
+from replays.studies.paper.reproduction import G, Reproduction, bare_drop, drop_impact, drop_impulse, drop_rebounds
 from replays.studies.paper.scans.condition import oscillator
 from replays.studies.paper.scans.pulse import Pulse
 from replays.studies.paper.scans.spread import free_values, phases
@@ -84,7 +84,16 @@ def drop_numbers(by_set: dict[str, Reproduction]) -> Numbers:
         "free": free,
         "fixed": compute_impact(masses.shaft_mass),
         "runs": {name: _drop_run(one) for name, one in by_set.items()},
+        "rebounds": {
+            f"{name}, {house}": (drop_rebounds(run), restitution(run) ** 2)
+            for name, one in by_set.items()
+            for house, run in (
+                ("rigid housing", bare_drop({"parameters": name, "model.stator": "rigid"})),
+                ("both housings", one.drop),
+            )
+        },
         "amplified": _amplification(by_set["corrected"].drop),
+        "passes": (masses.shaft_mass - free.restitution * masses.house_mass) / (masses.shaft_mass + masses.house_mass),
         "half_sine_ms": half_sine_ms,
         "ratio": half_sine_ms / (free.duration * 1e3),
         "soft": {
@@ -98,6 +107,17 @@ def drop_numbers(by_set: dict[str, Reproduction]) -> Numbers:
         "house_n": 100.0 * model.constants.house.inner_mass,
         "house_g_n": 100.0 * G * model.constants.house.inner_mass,
     }
+
+
+def restitution(run: Run) -> float:
+    """Return the coefficient of restitution of the drop's first contact on a fixed ring, by closed form."""
+    model = run.simulation.model
+    contact = model.constants.contact
+    return impact(
+        mass=reference_impact(model.parameters).shaft_mass, speed=compute_fall(model.constants)[1],
+        stiffness=contact.stiffness, exponent=contact.exponent, factor=contact.damping_factor,
+        speed_floor=contact.speed_floor,
+    ).restitution  # fmt: skip
 
 
 def _drop_run(one: Reproduction) -> Numbers:

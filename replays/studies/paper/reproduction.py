@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ FIG_7_M = 0.010
 PULSE_S = 0.5
 """Time of the pulse in the long run [s]."""
 _RATE_HZ = 20_000
+_MIN_REBOUND = 0.01
+"""Height of a rebound that counts, relative to the fall."""
 G = 9.80665
 """Standard gravity [m/s^2]."""
 _RESTS = 0.01
@@ -141,6 +144,15 @@ def drop_impact(run: Run) -> tuple[float, float]:
     return float(time_s), float(-2.0 * a * time_s - b)
 
 
+def drop_rebounds(run: Run) -> np.ndarray:
+    """Return the heights of the rebounds after the first contact, relative to the fall, of those of at least 1 %."""
+    contact = run.simulation.model.constants.contact
+    height = (run["ring_y"] + contact.clearance) / (2.0 * contact.clearance)
+    pushed = np.flatnonzero(np.diff(run["contact_impulse"]) > 0.0)
+    peaks = np.array([height[a + 1 : b + 1].max() for a, b in pairwise(pushed.tolist()) if b - a > 1])
+    return peaks[peaks >= _MIN_REBOUND]
+
+
 def drop_impulse(run: Run) -> float:
     """Return the impulse of the first contact [N s]."""
     impulse = run["contact_impulse"]
@@ -159,6 +171,7 @@ def drop_numbers(run: Run, *, bandwidth_hz: float = 4900.0) -> dict[str, float]:
         "drop_span": float(np.abs(run["ring_y"]).max() * 1e3),
         "drop_span_disk": float(np.abs(run["disk_y"]).max() * 1e3),
         "drop_settled": settled * 1e3,
+        "drop_bounces": float(len(drop_rebounds(run))),
         "drop_reaction": float(south.max()),
         "drop_acceleration": float(np.abs(run["inner_ay"]).max()),
         "drop_sensed": float(apply_low_pass(run, south, bandwidth_hz).max()),

@@ -67,7 +67,7 @@ def paper(
 
 
 def summary(findings: Findings) -> dict[str, object]:
-    """Return the summary as a JSON document; values are the 5, 50 and 95 % percentiles, NaN if undefined."""
+    """Return the summary as a JSON document; values are low, median and high, NaN if undefined."""
     from replays.studies.paper.scans.spread import percentiles
 
     return {
@@ -76,6 +76,8 @@ def summary(findings: Findings) -> dict[str, object]:
                 **line.statement.model_dump(exclude={"low", "high"}),
                 "values": {name: percentiles(values) for name, values in line.values.items()},
                 "inside": {name: line.statement.inside(values) for name, values in line.values.items()},
+                "bounds": {name: line.statement.bounds(values) for name, values in line.values.items()},
+                "runs": {name: line.statement.count_runs(values) for name, values in line.values.items()},
                 "verdicts": line.verdicts,
             }
             for line in [*findings.lines, *findings.claims]
@@ -96,4 +98,6 @@ def _show(findings: Findings, console: Console) -> None:
         says, _, *cells, verdict = row.cells
         table.add_row(says, *cells, Text(verdict, colours[row.mark]))
     console.print(table)
-    console.print(f"median (5–95 %), inside (number of cases) over phases, assumed values and readings; {JUDGED_BY}")
+    console.print(
+        f"median (5–95 %), share inside with 95 % bounds (runs), over phases, values and readings; {JUDGED_BY}"
+    )

@@ -49,6 +49,9 @@ _NAME_UNIT = re.compile(
     r"(?:[\s_](?:pp|p-p|pk|pk-pk|rms))?))\s*",
     re.IGNORECASE,
 )
+_CLOCK = re.compile(r"(?<!\d)(12|3|6|9)(?:h|\s?(?:[Uu]hr|o'?clock))(?![A-Za-z0-9])")
+_CLOCK_SIDES = {"12": "N", "3": "E", "6": "S", "9": "W"}
+"""Sides by positions of a clock seen from the drive; `3 H` is a third, horizontal signal."""
 _LONE_O = ("o", "fo", "po")
 _O = {"E": "W", "W": "E"}
 """Side meant by a lone `O`, by the other side that is named: Ost with W, Ouest or Oeste with E."""
@@ -106,7 +109,8 @@ def split_words(name: str) -> list[str]:
 
 def read_name(name: str) -> ParsedName:
     """Return the content of a signal name."""
-    words = split_words(name)
+    clock = _CLOCK.search(name)
+    words = split_words(name if clock is None else name.replace(clock[0], " "))
     kind, kind_word = "", ""
     for wanted in _KINDS:
         kind_word = _find_word(words, dict.fromkeys(_KINDS[wanted].split(), wanted))[1]
@@ -115,12 +119,14 @@ def read_name(name: str) -> ParsedName:
             break
     rest = [word for word in words if word != kind_word or len(kind_word) > 1]
     side_word = next((word for word in reversed(rest) if word in _SIDE_OF or word in _LONE_O), "")
-    side = _SIDE_OF.get(side_word, side_word[-1:].upper())
+    side = _CLOCK_SIDES[clock[1]] if clock else _SIDE_OF.get(side_word, side_word[-1:].upper())
     axis = _find_word(words, _AXIS_OF)[0]
     if words == ["n"]:
         kind = "speed"
     bare = all(word.isdigit() or word in _NUMBERING for word in words)
-    return ParsedName(kind, kind_word, _find_word(words, _PLACE_OF)[0], axis, side, len(side_word) == 1, bare)
+    return ParsedName(
+        kind, kind_word, _find_word(words, _PLACE_OF)[0], axis, side, not clock and len(side_word) == 1, bare
+    )
 
 
 def split_unit(name: str) -> tuple[str, str]:

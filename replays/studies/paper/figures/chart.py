@@ -75,7 +75,7 @@ def draw_verdicts(lines: list[Line]) -> Figure:
     """Draw the share and the position of our values in the stated range, for every statement with a range."""
     judged = [line for line in lines if math.isfinite(line.statement.low)]
     labels = [_label(line) for line in judged]
-    figure = new_figure(0.3 * len(judged) + 1.9, "Statements of the paper, and the spread of our results")
+    figure = new_figure(0.38 * len(judged) + 1.9, "Statements of the paper, and the spread of our results")
     inside, where = figure.subplots(1, 2, sharey=True, width_ratios=(0.7, 1.0))
     where.axvspan(0.0, 1.0, color="0.92", lw=0)
     looks = {"as-printed": (0.2, "s", "white"), "corrected": (-0.2, "o", None)}
@@ -84,7 +84,10 @@ def draw_verdicts(lines: list[Line]) -> Figure:
         for name, values in line.values.items():
             up, marker, fill = looks[name]
             colour = _VERDICTS[line.verdicts[name]]
-            inside.plot(100.0 * statement.inside(values), row - up, marker, color=colour, mfc=fill or colour, ms=6.5,
+            bounds = 100.0 * np.array(statement.bounds(values))
+            inside.plot(bounds, (row - up, row - up), color=colour, lw=2.2, alpha=0.55)
+            mark = "x" if statement.is_short(values) else marker
+            inside.plot(100.0 * statement.inside(values), row - up, mark, color=colour, mfc=fill or colour, ms=6.5,
                         mew=1.5, clip_on=False)  # fmt: skip
             if 0.0 < statement.low < statement.high < 20.0 * statement.low:
                 places = (np.array(percentiles(values)) - statement.low) / (statement.high - statement.low)
@@ -101,7 +104,7 @@ def draw_verdicts(lines: list[Line]) -> Figure:
     inside.set(xlim=(-3, 103), ylim=(len(judged) - 0.4, -0.6), xlabel="within the stated range [%]")
     where.set(
         xlim=(-1.1 * _EDGE_DISTANCE, 1.0 + 1.1 * _EDGE_DISTANCE),
-        xlabel="our 5 to 95 % between the paper's\nsmallest (0) and largest (1) value [1]",
+        xlabel="our range between the paper's\nsmallest (0) and largest (1) value [1]",
     )
     add_legend(figure, columns=5)
     return figure
@@ -110,7 +113,8 @@ def draw_verdicts(lines: list[Line]) -> Figure:
 def _label(line: Line) -> str:
     """Return the place and the text of a statement, in lines of at most 62 characters."""
     place = line.statement.place.replace("sections ", "§").replace("section ", "§").removesuffix(", measured")
-    return fill(f"{place}: {line.statement.says}".replace("_", ""), 62)
+    unbroken = line.statement.says.replace("_", "").replace(" = ", "\u00a0=\u00a0").replace(" − ", "\u00a0−\u00a0")
+    return fill(f"{place}: {unbroken}", 62)
 
 
 @house_style()

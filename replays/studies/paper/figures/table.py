@@ -127,7 +127,7 @@ def _lengths(findings: Findings) -> Content:
             cells = [f"{name}, {length_ms:g} ms"]
             for entry in (line.statement for line in findings.lines if line.statement.quantity in ("peak_x", "peak_y")):
                 values = column(group, f"true_{entry.quantity}_n")
-                cells += [distribution(values), f"{round(entry.inside(values) * len(values))} of {len(values)}"]
+                cells += [distribution(values), entry.format_share(values)]
             rows.append(Row(tuple(cells)))
     return Content(("pulse", "E − W [N]", "agree", "N − S [N]", "agree"), rows)
 

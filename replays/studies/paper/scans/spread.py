@@ -15,6 +15,8 @@ from replays.studies.paper.scans.pulse import PULSE_AT, Pulse, PulseRun
 from rig.physics.parameters import DEFAULT_SET, load_parameters
 
 SEED = 2013
+_PERCENTILE_RUNS = 20
+"""Values from which the 5 and 95 % percentiles lie inside the lowest and the highest."""
 
 
 class Assumed(BaseModel, frozen=True, extra="forbid"):
@@ -136,9 +138,9 @@ def rank_correlation(parts: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def percentiles(values: np.ndarray) -> tuple[float, float, float]:
-    """Return the 5, 50 and 95 % percentiles of the finite values; NaN if there are none."""
+    """Return the 5, 50 and 95 % percentiles of the finite values, or the range of fewer than 20; NaN without values."""
     there = values[np.isfinite(values)]
     if not len(there):
         return math.nan, math.nan, math.nan
-    low, middle, high = np.percentile(there, [5, 50, 95])
+    low, middle, high = np.percentile(there, [5, 50, 95] if len(there) >= _PERCENTILE_RUNS else [0, 50, 100])
     return float(low), float(middle), float(high)
