@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from replays.report.document import OUTCOME_MARKS, Mark, Report, Row
-from replays.report.writing import check_report, write_report
+from replays.report.writing import TEXT_SUFFIXES, check_report, write_report
 
-__all__ = ["OUTCOME_MARKS", "Mark", "Report", "Row", "check_report", "write_report"]
+__all__ = ["OUTCOME_MARKS", "TEXT_SUFFIXES", "Mark", "Report", "Row", "check_report", "write_report"]

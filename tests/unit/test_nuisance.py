@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -18,11 +19,12 @@ from replays.recordings.formats.conversion import convert, write_recording
 from replays.recordings.formats.mapping import load_mapping, parse_mapping
 from replays.recordings.identification.agreement import solve_weighted
 from replays.recordings.identification.log import identify_log
-from replays.recordings.identification.nuisance import find_nuisances, tune
+from replays.recordings.identification.nuisance import Tuned, find_nuisances, tune
 from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import predict, read_measured
 from replays.recordings.resimulation.sensitivity import ANGLE, get_value, with_values
 from replays.recordings.validation import load_criteria, validate
+from replays.recordings.validation.explanations.budget import make_fit_budgets
 from replays.recordings.validation.explanations.channel_fit import Shown
 from replays.recordings.validation.explanations.signals import edge_faults
 from replays.recordings.validation.explanations.timing import filtered
@@ -31,6 +33,7 @@ from rig.channels.table import default_table
 from rig.run.offline import simulate
 from rig.run.scenes import load_scene
 from tests import faulty_logs, second_rig
+from tests.commands import run_captured
 
 PPM, TURNED = 40.0, 2.1
 MATRIX = pytest.mark.skipif("RIG_FAULTY_LOGS" not in os.environ, reason="RIG_FAULTY_LOGS=1: twenty minutes")
@@ -151,6 +154,66 @@ def test_floated_friction_of_a_log_is_fitted_and_the_rest_is_judged_with_it(mils
     assert found.good, found.verdict_line
     assert abs(entry["value"] - 0.25) < entry["half_width"] < 0.01
     assert found.verdict_line.endswith("; fitted, and not judged: contact.friction")
+
+
+def tune_few_channels(folder: Path, motion: second_rig.Motion, *, seed: int = 3, **gains: float) -> Tuned:
+    """Return the fit of a log of some channels, with gain errors."""
+    names = ("disk_x", "disk_y", "ring_x", "ring_y", "outer_y", "speed", "hammer", "keyphasor")
+    own_s, values = second_rig.record_log(motion, seed=seed, rate_hz=12_800.0, ppm=PPM)
+    head, *parts = WHOLE.split("[channels.")
+    mapping = head + "".join(f"[channels.{part}" for part in parts if part.partition("]")[0] in names)
+    folder.mkdir()
+    columns = {"time": own_s, **{name: gains.get(name, 1.0) * values[name] for name in names}}
+    log = import_log(folder, columns, mapping)
+    return tune(log, Experiment.from_recording(log))
+
+
+MOTION_KEYS = (ANGLE, "state.ring_x", "state.ring_y", "state.vx", "state.vy", "drive.speed_hz", "ring.offset_y")
+
+
+def test_a_gain_error_changes_the_fit_of_a_log_as_its_budget_predicts(
+    motion: second_rig.Motion, tmp_path: Path
+) -> None:
+    rules = load_criteria().imported
+    tuned = tune_few_channels(tmp_path / "right", motion)
+    wrong = tune_few_channels(tmp_path / "wrong", motion, outer_y=1.0 + rules.calibration)
+    compared = 0
+    for budget in make_fit_budgets(tuned, rules):
+        expected = budget.by_gain["outer_y"]
+        if budget.name in MOTION_KEYS and abs(expected) > 0.3 * budget.contributions["noise"]:
+            moved = wrong.values[budget.name] - tuned.values[budget.name]
+            assert moved == pytest.approx(expected, rel=0.3), budget.name
+            compared += 1
+    assert compared >= 2
+
+
+@MATRIX
+def test_the_spread_of_ten_logs_is_the_noise_of_the_budget(motion: second_rig.Motion, tmp_path: Path) -> None:
+    # Ten logs determine a standard deviation to 24 %. Clock, pulse and friction spread by more than their noise, as the
+    # simulated pulse has whole ticks; the contribution of the model contains this.
+    fits = [tune_few_channels(tmp_path / str(seed), motion, seed=seed) for seed in range(40, 50)]
+    budgets = {one.name: one for one in make_fit_budgets(fits[0], load_criteria().imported)}
+    ratios = np.array([
+        np.std([fit.values[key] for fit in fits], ddof=1) / budgets[key].contributions["noise"] for key in MOTION_KEYS
+    ])  # fmt: skip
+    assert np.sqrt(np.mean(ratios**2)) == pytest.approx(1.0, abs=0.3)
+    assert ((ratios > 0.45) & (ratios < 1.6)).all(), ratios
+
+
+def test_budget_of_a_log_is_a_page_with_labelled_assumptions(
+    mils: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "budget.md"
+    code, out, _ = run_captured(capsys, "validate", str(mils.path), "--budget", str(page), "--json")
+    text, document = page.read_text(encoding="utf-8"), json.loads(out)
+    assert code == 0
+    rows = {one["name"]: one for one in document["budget"]}
+    assert {"clock.rate_ppm", "hammer.1.force_n", "whirl 3: whirl_frequency"} <= rows.keys()
+    for name, one in rows.items():
+        assert one["expanded"] == pytest.approx(2.0 * math.hypot(*one["contributions"].values())), name
+        assert f"| {name} [" in text
+    assert "| calibration | 0.20% of each channel | assumed: criteria, [imported] calibration | not known |" in text
+    assert "Not known, and not included" in text
 
 
 @MATRIX

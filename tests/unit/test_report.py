@@ -183,3 +183,15 @@ def test_a_long_report_begins_with_its_contents(tmp_path: Path) -> None:
     short.heading("Alone")
     write_report(short, tmp_path / "short.html")
     assert "<nav>" not in (tmp_path / "short.html").read_text()
+
+
+def test_markdown_has_text_tables_and_captions(tmp_path: Path) -> None:
+    report = _report()
+    report.table(("a|b", "c"), [("1", "2|3")])
+    write_report(report, tmp_path / "report.md")
+    blocks = (tmp_path / "report.md").read_text(encoding="utf-8").split("\n\n")
+    assert blocks[:5] == [
+        "# Validation of <b>a & b</b>.mcap", "One of two criteria is met.", "## Free run", "μ = 0.25", "At 6.2 Hz",
+    ]  # fmt: skip
+    assert blocks[5].splitlines()[1:3] == ["| --- | --- | --- |", "| whirl | 83.1 Hz | agrees |"]
+    assert blocks[6:] == ["A line", "| a\\|b | c |\n| --- | --- |\n| 1 | 2\\|3 |\n"]

@@ -432,3 +432,12 @@ def test_a_floated_number_is_no_candidate_for_a_cause() -> None:
     names = {one.name for one in rules.attribution.candidates}
     assert not names & {"house.pair_stiffness", "house.pair_stiffness_vertical"}
     assert "house.pair_stiffness_horizontal" in names
+
+
+def test_a_budget_needs_a_log_and_a_known_suffix(hammer: Recording, capsys: pytest.CaptureFixture[str]) -> None:
+    out = hammer.path.with_name("budget")
+    code, _, text = run_captured(capsys, "validate", str(hammer.path), "--budget", f"{out}.md")
+    assert (code, "--budget must be used with a log of another system" in text) == (2, True), text
+    code, _, text = run_captured(capsys, "validate", str(hammer.path), "--budget", f"{out}.txt")
+    assert (code, "ends in .html, .pdf or .md" in text) == (2, True), text
+    assert not out.with_suffix(".md").exists()

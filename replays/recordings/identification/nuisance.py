@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -151,6 +151,7 @@ class Tuned:
         end_s: End of the samples of the fit [s].
         longest_s: End of the samples if the model had explained all of them [s].
         scales: Residual rms over noise of each channel, at least 1.
+        parts: Samples of the fit.
     """
 
     baseline: Experiment
@@ -163,6 +164,7 @@ class Tuned:
     end_s: float
     longest_s: float
     scales: dict[str, float]
+    parts: dict[str, Measured] = field(repr=False)
 
     def to_model_clock(self, parts: dict[str, Measured]) -> dict[str, Measured]:
         """Return channels of the log on the model's clock."""
@@ -363,6 +365,7 @@ def tune(
         end_s=fit.end_s,
         longest_s=end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), fit.scales, strict=True)),
+        parts={name: part.select_until(fit.end_s) for name, part in whole.items()},
     )
 
 
@@ -474,9 +477,8 @@ def _fit_windows(
 
         def fitted(start: np.ndarray) -> tuple[np.ndarray, ChannelState, list[float]]:
             fit, here = approach(predictor, start, priors, by_residuals=by_residuals, enabled=every)  # noqa: B023
-            enabled = [has and rms(z) <= _FAULTY_RMS for z, has in zip(here.apart, every, strict=True)]
-            if len(enabled) / 2.0 < sum(enabled) < len(enabled):
-                # Faulty channels are left out: even a small weight would move values that no other channel shows.
+            enabled = select_sound([rms(z) if has else math.inf for z, has in zip(here.apart, every, strict=True)])
+            if not all(enabled):
                 fit, here = approach(predictor, fit, priors, by_residuals=True, enabled=enabled)  # noqa: B023
             return fit, here, [max(1.0, rms(z)) for z in here.apart]
 
@@ -497,6 +499,15 @@ def _fit_windows(
         before = np.diag(priors[1] ** -2.0), np.zeros(len(values))
         end_s, jackknife = first_s + length, jackknife_half_widths(here, times, scales, before, first_s)
     return _WindowFit(values, covariance, np.array(moves[-_COUNTED_GROWTHS:]), end_s, scales, jackknife)
+
+
+def select_sound(scales: Sequence[float]) -> list[bool]:
+    """Return a mask without faulty channels, if they are a minority, by the residuals over the noise.
+
+    Even a small weight of a faulty channel would move values that no other channel shows.
+    """
+    sound = [scale <= _FAULTY_RMS for scale in scales]
+    return sound if sum(sound) > len(sound) / 2.0 else [True] * len(sound)
 
 
 def _is_worse(now: list[float], before: list[float]) -> bool:

@@ -27,6 +27,7 @@ from replays.recordings.validation.explanations.attribution import (
     explain_by_defects,
     explain_log,
 )
+from replays.recordings.validation.explanations.budget import Budget, make_fit_budgets, make_quantity_budgets
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import find_common_delay, select_channels
 from replays.recordings.validation.explanations.model_parameters import find_changes
@@ -34,9 +35,10 @@ from replays.recordings.validation.explanations.signals import SignalFault, edge
 from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import CONTACT, PHASES, Phase
-from replays.recordings.validation.statistics import perturbed, statistics
+from replays.recordings.validation.statistics import StatisticResult, make_quantity_reader, perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
 from replays.recordings.validation.truth import judge_truth, recorded_truth
+from rig.base.errors import InputError, Words
 from rig.base.wire import TRUTH
 
 _MAX_CHECKED = 3
@@ -50,6 +52,7 @@ def validate(
     changes: dict[str, Any] | None = None,
     declared: bool = False,
     blind: bool = False,
+    budget: bool = False,
     step: Callable[[str], None] = lambda _text: None,
 ) -> Validation:
     """Validate a recording by a re-simulation of its experiment.
@@ -61,6 +64,7 @@ def validate(
         declared: Whether the declared criteria decide even if every bit is equal, as for a recording of another
             build.
         blind: Whether to ignore the faults that were injected on command.
+        budget: Whether to compute the uncertainties of the fitted numbers and quantities of a log.
         step: Function that is called with the current step.
 
     Raises:
@@ -70,8 +74,7 @@ def validate(
     experiment = Experiment.from_recording(recording)
     if changes:
         experiment = experiment.with_changes(changes)
-    if criteria.floating:
-        ask(recording, experiment, criteria.floating)  # reports a wrong key before the long fit
+    _check_request(recording, experiment, criteria, budget=budget)
     recording = recording.without_faults() if blind else recording.with_true_blocks()
     if blind:
         experiment = experiment.without_faults()
@@ -79,7 +82,6 @@ def validate(
     begin, end, reason = _window(again)
     trajectory = residuals(again.parts, again.nominal, again.others, again.criteria, end_s=end)
     tables = recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
-    # Noise limits a fitted number, but not the truth.
     truth = [] if criteria.floating else judge_truth(tables, again.nominal, again.others[0], criteria, end_s=end)
     doubts = [*recording.doubts, *parameter_doubts(recording)]
     lost = missing_rows(recording) if blind else {}
@@ -104,14 +106,14 @@ def validate(
         path=recording.path, scene=experiment.scene.name, criteria=again.criteria.title, changes=dict(changes or {}),
         bits=again.bits, bit_exact=bool(again.bits) and all(one.equal for one in again.bits.values()),
         declared=declared, window_s=(begin, end), window_reason=reason, residuals=tuple(trajectory),
-        truth=tuple(truth), phases=tuple(phases), statistics=tuple(judged),
-        calibration=tuple(remarks),
+        truth=tuple(truth), phases=tuple(phases), statistics=tuple(judged), calibration=tuple(remarks),
         skipped=sum(rows for rows, _ in lost.values())
         or sum(one.skipped for one in again.bits.values())
         or sum(stream.lost - stream.declared for stream in recording.streams.values()),
         explained=None, fitted=again.fitted, floating=criteria.floating,
         parts=again.parts, nominal=again.nominal, files=len(recording.parts), **_contact(again, phases, end),
         doubts=tuple(doubts), faults=again.faults, complete=recording.complete,
+        budgets=_make_budgets(again, phases, judged, step) if budget else (),
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     # Without the truth a number of the model may be the cause, if the difference begins with the recording.
@@ -163,6 +165,31 @@ def validate(
             explained = replace(explained, conclusion=text, best=())
     failed = [one.channel for one in trajectory if one.good is False]
     return replace(validation, explained=explain_assumed(explained, recording, failed))
+
+
+def _check_request(recording: Recording, experiment: Experiment, criteria: Criteria, *, budget: bool) -> None:
+    """Report errors of the request before the long fit."""
+    if budget and not is_imported(recording):
+        raise InputError("--budget", "used with a log of another system", Words(str(recording.path)))
+    if criteria.floating:
+        ask(recording, experiment, criteria.floating)
+
+
+def _make_budgets(
+    again: _Resimulation, phases: Sequence[Phase], judged: Sequence[StatisticResult], step: Callable[[str], None]
+) -> tuple[Budget, ...]:
+    assert again.tuned is not None
+    step("uncertainty budget")
+    rules, models = again.criteria.imported, len(again.criteria.imported.variants) + 1
+    named = {
+        (one.number, one.quantity): (f"{one.phase} {one.number + 1}: {one.quantity}", one.unit, one.recorded)
+        for one in judged
+        if one.limit is not None
+    }
+    read = make_quantity_reader(again.quick, again.parts, phases)
+    fits, filters, variants = again.members[::models], again.others[-2], again.others[-1 - models : -2]
+    budgets = make_quantity_budgets(named, read, again.parts, again.nominal, fits, filters, variants, rules)
+    return (*make_fit_budgets(again.tuned, rules), *budgets)
 
 
 def _unexplained(from_s: float, conclusion: str) -> Explained:

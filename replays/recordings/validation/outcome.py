@@ -15,6 +15,7 @@ from replays.recordings.identification.request import fit_unit
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.bits import StreamBits
 from replays.recordings.validation.explanations.attribution import Explained
+from replays.recordings.validation.explanations.budget import Budget
 from replays.recordings.validation.explanations.signals import SignalFault
 from replays.recordings.validation.phases import QUANTITIES, Phase
 from replays.recordings.validation.statistics import StatisticResult
@@ -81,6 +82,7 @@ class Validation:
         doubts: Inconsistencies within the recording; with any of them the validation fails.
         complete: Whether the recording was finished.
         contact_s: First contact of a log, if the trajectory ends before it [s]; otherwise None.
+        budgets: Uncertainties of fitted numbers and quantities of a log, on request.
         due_s: The same if the trajectory would have reached it with a valid model.
     """
 
@@ -110,6 +112,7 @@ class Validation:
     contact_s: float | None = None
     due_s: float | None = None
     complete: bool = True
+    budgets: tuple[Budget, ...] = ()
 
     def _repr_html_(self) -> str:
         title = f"{self.title}, by {self.criteria}: {self.outcome}; {self.bits_line}"
@@ -274,6 +277,7 @@ class Validation:
                     for one in self.fitted
                     if one.key in self.floating
                 },
+                "budget": [{**asdict(one), "expanded": one.expanded} for one in self.budgets],
                 "calibration": list(self.calibration),
                 "window": {"from_s": self.window_s[0], "to_s": self.window_s[1], "reason": self.window_reason},
                 "trajectory": [asdict(one) for one in self.residuals],

@@ -8,7 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.recordings.identification.request import fit_unit
 from replays.recordings.resimulation.prediction import Measured
+from replays.recordings.resimulation.sensitivity import CLOCK
+from replays.recordings.validation.criteria import Criteria
+from replays.recordings.validation.explanations.budget import COVERAGE
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
 from replays.recordings.validation.statistics import NOT_JUDGED
@@ -56,6 +60,71 @@ def make_report(validation: Validation, *, origin: Mapping[str, str] | None = No
         report.text("The recording's own calibration is used throughout. Differences from the rig's channel table:")
         report.table(("channel", "differs in"), [tuple(line.partition(": ")[::2]) for line in validation.calibration])
     return report
+
+
+def make_budget_report(
+    validation: Validation, criteria: Criteria, *, origin: Mapping[str, str] | None = None
+) -> Report:
+    """Return the uncertainty budget of a log's validation as a report.
+
+    Args:
+        validation: The validation, with budgets.
+        criteria: Criteria, with the assumed uncertainties.
+        origin: Facts about the origin of the report, by name.
+    """
+    report = Report(
+        f"Uncertainty budget of {validation.title}",
+        f"U is the expanded uncertainty with k = {COVERAGE:g}, about 95 %; other columns are standard uncertainties.",
+        origin=origin,
+    )
+    keys = [one.key for one in validation.fitted]
+    for title, budgets in (
+        ("Fitted numbers", [one for one in validation.budgets if one.name in keys]),
+        ("Judged quantities", [one for one in validation.budgets if one.name not in keys]),
+    ):
+        if not budgets:
+            continue
+        report.heading(title)
+        report.table(
+            ("number", "value", *budgets[0].contributions, "combined", "U"),
+            [
+                (f"{one.name} [{one.unit or '1'}]", f"{one.value:.6g}",
+                 *(f"{u:.2g}" for u in (*one.contributions.values(), one.combined, one.expanded)))
+                for one in budgets
+            ],
+        )  # fmt: skip
+    report.heading("Sources")
+    report.table(("source", "standard uncertainty", "basis", "degrees of freedom"), _sources(validation, criteria))
+    report.text(
+        "Contributions are combined as independent ones. After the first impacts the motion is chaotic: its spread is "
+        "in `fit`. Clock, pulse and friction are less repeatable than their `noise`; this is in `model`. "
+        "Not known, and not included: linearity, temperature, cross-sensitivity and mounting of the sensors; "
+        "repeatability of the experiment, as the log is a single run."
+    )
+    return report
+
+
+def _sources(validation: Validation, criteria: Criteria) -> list[tuple[str, str, str, str]]:
+    """Return the inputs of a budget: source, standard uncertainty, basis, degrees of freedom."""
+    rules = criteria.imported
+    draws = -(-criteria.ensemble.members // (len(rules.variants) + 1))
+    priors = {one.key: f"{one.key} {one.prior[1]:.2g} {fit_unit(one.key)}" for one in validation.fitted if one.prior}
+    clock, others = (
+        ", ".join(text for key, text in priors.items() if (key in CLOCK) is here) or "none" for here in (True, False)
+    )
+    variants = ", ".join(f"{key} = {value}" for one in rules.variants for key, value in one.set.items())
+    corner = f"; {validation.calibration_line}" if validation.calibration else ""
+    fitted, assumed = len(validation.fitted), "assumed: criteria, [imported]"
+    return [
+        ("noise", "of each channel", "measured in the log, as white noise", f"samples - {fitted}"),
+        ("calibration", f"{rules.calibration:.2%} of each channel", f"{assumed} calibration", "not known"),
+        ("filter", f"{1.0 - rules.bandwidth:.1%} of each corner", f"{assumed} bandwidth{corner}", "not known"),
+        ("clock", clock, "assumed: a crystal, a trigger found in filtered samples", "not known"),
+        ("inputs", others, "assumed, or read from the log (speed, pulse)", "not known"),
+        ("model", variants, f"{assumed} variants", "not known"),
+        ("model", "of each number", "changes with the window, and jackknife over channels and blocks of time", "2"),
+        ("fit", "of all fitted numbers", "draws from their uncertainty", str(draws)),
+    ]
 
 
 def _sentence(text: str) -> str:

@@ -139,6 +139,18 @@ def statistics(
     return phases, results
 
 
+def make_quantity_reader(
+    experiment: Experiment, parts: dict[str, Measured], phases: Sequence[Phase]
+) -> Callable[[dict[str, np.ndarray]], dict[tuple[int, str], float]]:
+    """Return a function that returns the quantities of values, by the phase's number and the quantity's name."""
+    look = _viewer(experiment, parts)
+    return lambda values: {
+        (number, name): value
+        for number, phase in enumerate(phases)
+        for name, value in quantities(look(values, phase), phase.name).items()
+    }
+
+
 def _floor(parts: dict[str, Measured], names: tuple[str, ...]) -> float:
     """Return the noise floor of the sum of those channels that are present."""
     floors = [part.floor[c] for part in parts.values() for c, name in enumerate(part.names) if name in names]

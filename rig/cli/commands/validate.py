@@ -47,6 +47,10 @@ def validate(
     ] = False,
     blind: Annotated[bool, typer.Option("--blind", help="Ignore the faults that the recording declares")] = False,
     report: ReportFile = None,
+    budget: Annotated[
+        Path | None,
+        typer.Option("--budget", metavar="FILE", help="Uncertainty budget of a log: .html, .pdf or .md"),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for the results of a folder")
     ] = None,
@@ -64,19 +68,21 @@ def validate(
     from recorder.reader import join
     from replays.recordings.validation import load_criteria
     from replays.recordings.validation import validate as hold
-    from replays.report import check_report, write_report
+    from replays.report import TEXT_SUFFIXES, check_report, write_report
     from rig.run.scenes import read_value
 
     if report is not None:
         check_report(report, force=force)
+    if budget is not None:
+        check_report(budget, force=force, field="--budget", suffixes=TEXT_SUFFIXES)
     rules = load_criteria(criteria)
     rules = rules.with_floating((*rules.floating, *split_names(floating)))
     texts = SceneChanges(changes=changes, engine=engine).overrides()
     overrides = {key: read_value(value) for key, value in texts.items()}
     options: dict[str, Any] = {"criteria": rules, "changes": overrides, "declared": declared, "blind": blind}
     if any(file.is_dir() for file in files):
-        if len(files) > 1 or report is not None:
-            raise InputError("FILE", "one folder, without --report", Words(" ".join(map(str, files))))
+        if len(files) > 1 or report is not None or budget is not None:
+            raise InputError("FILE", "one folder, without --report and --budget", Words(" ".join(map(str, files))))
         rows = _validate_folder(files[0], output or files[0], options, jobs=jobs, force=force)
         _show_folder(rows, output or files[0], form)
         return
@@ -84,18 +90,25 @@ def validate(
         raise InputError("--output", "left out, except for a folder", str(output))
     recording = join(files)
     with reporting(compiles=True) as reporter:
-        result = hold(recording, step=reporter.step, **options)
+        result = hold(recording, step=reporter.step, budget=budget is not None, **options)
+        origin = recording_origin(result.title, recording)
         if report is not None:
             from replays.recordings.validation.report import make_report
 
             reporter.step("report")
-            write_report(make_report(result, origin=recording_origin(result.title, recording)), report)
+            write_report(make_report(result, origin=origin), report)
+        if budget is not None:
+            from replays.recordings.validation.report import make_budget_report
+
+            write_report(make_budget_report(result, rules, origin=origin), budget)
     if form.as_json:
         echo_json(result.document())
     else:
         _show(result, form.console())
         if report is not None:
             echo(f"report  {report}")
+        if budget is not None:
+            echo(f"budget  {budget}")
     if result.outcome.exit_status:
         raise typer.Exit(result.outcome.exit_status)
 
