@@ -1,8 +1,8 @@
 """An independent simulator of the same laboratory, which shares no code with the product.
 
 Its logs test validation. Deliberate differences: the shaft is a direction in space with an angular momentum (a heavy
-symmetric top), not angles; friction is `mu F_n tanh(v_t / 1 mm/s)`; classical Runge-Kutta at steps of 2 us through
-contacts, whose onset is the first step that ends inside the ring; sensors after a low-pass of scipy, with
+symmetric top), not angles; friction is `mu F_n tanh(v_t / 1 mm/s)`; classical Runge-Kutta at steps of 2 us, with the
+onset of each contact located by bisection; sensors after a low-pass of scipy, with
 independent noise, clock and shaft angle.
 
     L' = torque,  u' = L x u / Ixx,  w = L . u / Izz,  theta' = w - G' u_x,
@@ -67,6 +67,8 @@ class Rig(NamedTuple):
     k_ew: float = 2 * 8.88e7
     P0: float = 3000.0
     g: float = 9.81
+    exponent: float = 1.5
+    late: bool = False  # each contact begins with the first step that ends inside the ring
 
 
 @njit(cache=True)
@@ -100,7 +102,7 @@ def _rates(rig, t, omega0, pulse, v0, y, dy, seen):
     if depth > 0.0 and v0 > 0.0:
         nx, ny = ex / r, ey / r
         rx, ry = rig.arm_ring * vx - y[11], rig.arm_ring * vy - y[12]
-        force = max(0.0, rig.K * depth**1.5 * (1.0 + rig.c * (rx * nx + ry * ny) / v0))
+        force = max(0.0, rig.K * depth**rig.exponent * (1.0 + rig.c * (rx * nx + ry * ny) / v0))
         rub = rig.mu * force * math.tanh((ry * nx - rx * ny + rig.R_S * w) / rig.v_s)
         cx, cy, couple = -force * nx + rub * ny, -force * ny - rub * nx, -rig.R_S * rub
     fx += rig.arm_ring * cx
@@ -130,26 +132,42 @@ def _rates(rig, t, omega0, pulse, v0, y, dy, seen):
 
 
 @njit(cache=True)
+def _step(rig, t, h, omega0, pulse, v0, y, work):
+    k1, k2, k3, k4, z, none = work
+    _rates(rig, t, omega0, pulse, v0, y, k1, none)
+    z[:] = y + 0.5 * h * k1
+    _rates(rig, t + 0.5 * h, omega0, pulse, v0, z, k2, none)
+    z[:] = y + 0.5 * h * k2
+    _rates(rig, t + 0.5 * h, omega0, pulse, v0, z, k3, none)
+    z[:] = y + h * k3
+    _rates(rig, t + h, omega0, pulse, v0, z, k4, none)
+    return y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+@njit(cache=True)
 def _run(rig, y, omega0, pulse, t0, steps, every, rows):
-    k1, k2, k3, k4, z, none = np.empty(15), np.empty(15), np.empty(15), np.empty(15), np.empty(15), np.empty(15)
-    h, v0, contacts = STEP_S, 0.0, 0
+    work, h, v0, contacts = np.empty((6, 15)), STEP_S, 0.0, 0
     for n in range(steps):
-        t = t0 + n * h
-        inputs = rows[n // every] if n % every == 0 else none
-        depth, rate = _rates(rig, t, omega0, pulse, v0, y, k1, inputs)
+        t, part = t0 + n * h, 0.0
+        inputs = rows[n // every] if n % every == 0 else work[5]
+        _rates(rig, t, omega0, pulse, v0, y, work[0], inputs)
+        ahead = _step(rig, t, h, omega0, pulse, v0, y, work)
+        depth, rate = _rates(rig, t + h, omega0, pulse, v0, ahead, work[0], work[5])
         if depth > 0.0 and v0 == 0.0:
+            low, part = 0.0, 1.0
+            for _ in range(0 if rig.late else 50):
+                middle = 0.5 * (low + part)
+                depth, _rate = _rates(rig, t, omega0, pulse, v0, _step(rig, t, middle * h, omega0, pulse, v0, y, work),
+                                      work[0], work[5])  # fmt: skip
+                low, part = (low, middle) if depth > 0.0 else (middle, part)
+            start = _step(rig, t, part * h, omega0, pulse, v0, y, work)
+            depth, rate = _rates(rig, t + part * h, omega0, pulse, v0, start, work[0], work[5])
             v0 = max(rate, 1e-3)
             contacts += 1
-            _rates(rig, t, omega0, pulse, v0, y, k1, inputs)
+            ahead = _step(rig, t + part * h, (1.0 - part) * h, omega0, pulse, v0, start, work)
         elif depth <= 0.0:
             v0 = 0.0
-        z[:] = y + 0.5 * h * k1
-        _rates(rig, t + 0.5 * h, omega0, pulse, v0, z, k2, none)
-        z[:] = y + 0.5 * h * k2
-        _rates(rig, t + 0.5 * h, omega0, pulse, v0, z, k3, none)
-        z[:] = y + h * k3
-        _rates(rig, t + h, omega0, pulse, v0, z, k4, none)
-        y += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        y[:] = ahead
     return contacts
 
 
@@ -209,7 +227,7 @@ def simulate_pulse(
     omega = 2.0 * math.pi * speed_hz
     u = np.array([0.0, uy, math.sqrt(1.0 - uy * uy)])
     y = np.concatenate([u, rig.Izz * omega * u, [turned], np.zeros(8)])
-    every = 2
+    every = 1
     rows = np.empty((round((before_s + after_s) / STEP_S / every), len(_NAMES)))
     quiet = np.empty((1, len(_NAMES)))
     pulse = (before_s, duration_ms * 1e-3, force_n)
@@ -274,6 +292,8 @@ def record_log(
         noise: Factor of the sensors' noise.
         edit: Changes the signals before the filter: faults of sensors.
     """
+    from scipy.interpolate import CubicSpline
+
     rng = np.random.default_rng(seed)
     n = int((len(motion.values["speed"]) - 4) / motion.rate_hz * rate_hz)
     own_s = np.arange(n) / rate_hz
@@ -283,6 +303,6 @@ def record_log(
         kind = low_pass if isinstance(low_pass, str) else low_pass.get(name, "butterworth")
         slow = ("butterworth", 200.0) if name == "speed" else (kind, bandwidth_hz)
         smooth = apply_low_pass(slow[0], values, motion.rate_hz, slow[1])
-        found[name] = np.interp(place, np.arange(len(smooth)), smooth)
+        found[name] = CubicSpline(np.arange(len(smooth)), smooth)(place)
         found[name] += noise * NOISE[name] * rng.standard_normal(n)
     return own_s, found
