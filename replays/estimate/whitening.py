@@ -20,6 +20,8 @@ _DOUBT = 4.0
 """Standard deviations of a line's estimate by which it must exceed white noise to be coloured."""
 _EXTRAPOLATED = 4.0
 """Density at frequency 0 over that of the first line: that of a random walk at half of its frequency."""
+_LINE_NEIGHBOURS = 15
+"""Frequencies of a running median, which a line does not affect."""
 _SETTLED = 0.99
 """Part of the filter's energy after which its start has no effect."""
 
@@ -70,6 +72,20 @@ class NoiseSpectrum:
     def low(self) -> float:
         """Density of slow parts: the mean over the lowest sixty-fourth of the frequencies."""
         return float(self.density[: max(2, len(self.density) // 128)].mean())
+
+    @property
+    def excess(self) -> float:
+        """RMS of the noise beyond white noise, over that of white noise."""
+        return float(np.sqrt(self.density.mean() - 1.0))
+
+    @property
+    def largest_line(self) -> float:
+        """Largest RMS of a single line over that of white noise."""
+        from scipy.ndimage import median_filter
+
+        half = self.density[2 : len(self.density) // 2]
+        above = np.maximum(half - median_filter(half, _LINE_NEIGHBOURS, mode="nearest"), 0.0)
+        return float(np.sqrt(2.0 * np.convolve(above, np.ones(3)).max() / len(self.density)))
 
     @cached_property
     def response(self) -> np.ndarray:

@@ -120,7 +120,10 @@ def approach(
     here = evaluate(predictor, values)
     assert here is not None
     for _ in range(_MAX_STEPS):
-        slopes = predictor.derivatives(values).slopes
+        slopes = [
+            {name: predictor.parts[name].whiten(slope) for name, slope in one.items()}
+            for one in predictor.derivatives(values).slopes
+        ]
         by_key = [[one / floor for one, floor in split_channels(predictor.parts, slope)] for slope in slopes]
         here = ChannelState(here.apart, [np.column_stack(columns) for columns in zip(*by_key, strict=True)])
         channel_weights = [max(1.0, rms(z)) for z in here.apart] if by_residuals else signal_sizes(predictor.parts)
@@ -146,7 +149,7 @@ def evaluate(predictor: Predictor, values: np.ndarray) -> ChannelState | None:
         predicted = predictor.predict(values).values
     except (InputError, SimulationError):
         return None
-    apart = {name: part.values - predicted[name] for name, part in predictor.parts.items()}
+    apart = {name: part.whiten(part.values - predicted[name]) for name, part in predictor.parts.items()}
     return ChannelState([one / floor for one, floor in split_channels(predictor.parts, apart)], [])
 
 

@@ -69,6 +69,8 @@ def identify_log(
         recording, tuned.baseline, (*keys, *nuisances), start=tuned.values, bounds=bounds, priors=all_priors,
         nuisances=nuisances, channels=channels, window=(window_start_s(tuned.baseline), tuned.end_s),
     )  # fmt: skip
+    parts = {name: part.with_spectra(tuned.spectra) for name, part in question.observation.parts.items()}
+    question = replace(question, observation=replace(question.observation, parts=parts))
     progress("effect of filters with other corners")
     other = {name: part.with_corner_factor(bandwidth) for name, part in question.observation.parts.items()}
     apart = _window(question, other).predicted(z := np.zeros(len(question.keys))) - _window(question).predicted(z)

@@ -15,6 +15,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.estimate.intervals import draw_normal, format_with_half_width
+from replays.estimate.whitening import NoiseSpectrum
 from replays.recordings.identification.agreement import (
     MAX_PRIOR_DEVIATION,
     ChannelState,
@@ -28,6 +29,7 @@ from replays.recordings.identification.agreement import (
     split_channels,
     subtract_mean,
 )
+from replays.recordings.identification.noise import with_spectra
 from replays.recordings.identification.request import first_command_s, fit_unit, observe
 from replays.recordings.resimulation.experiment import PICKUP_S, Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction
@@ -151,7 +153,11 @@ class Tuned:
         end_s: End of the samples of the fit [s].
         longest_s: End of the samples if the model had explained all of them [s].
         scales: Residual rms over noise of each channel, at least 1.
+<<<<<<< HEAD
         parts: Samples of the fit.
+=======
+        spectra: Spectrum of the noise of each channel that is not white, by name.
+>>>>>>> 9f44bce9 (wip2)
     """
 
     baseline: Experiment
@@ -164,7 +170,11 @@ class Tuned:
     end_s: float
     longest_s: float
     scales: dict[str, float]
+<<<<<<< HEAD
     parts: dict[str, Measured] = field(repr=False)
+=======
+    spectra: dict[str, NoiseSpectrum]
+>>>>>>> 9f44bce9 (wip2)
 
     def to_model_clock(self, parts: dict[str, Measured]) -> dict[str, Measured]:
         """Return channels of the log on the model's clock."""
@@ -337,6 +347,10 @@ def tune(
     end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
     whole = observe(recording, baseline, channels=channels, window=(window_start_s(baseline), end_s)).parts
     whole = {name: part.remove_delays(late_s or {}) for name, part in whole.items()}
+    quiet = {name: part.select_until(first_s - _MARGIN_S) for name, part in whole.items()}
+    if all(len(part.times_s) for part in quiet.values()):
+        quiet = with_spectra(quiet, Predictor(baseline, (), quiet).predict(()).values)
+        whole = {name: replace(part, spectra=quiet[name].spectra) for name, part in whole.items()}
     whole = {name: _decimate(part, first_s - _FULL_RATE_S) for name, part in whole.items()}
     fit = _fit_best(baseline, wanted, whole, progress)
     if max(fit.scales) > _FAULTY_RMS and (early := _with_earlier_pulse(baseline, whole)) is not None:
@@ -365,7 +379,11 @@ def tune(
         end_s=fit.end_s,
         longest_s=end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), fit.scales, strict=True)),
+<<<<<<< HEAD
         parts={name: part.select_until(fit.end_s) for name, part in whole.items()},
+=======
+        spectra={name: one for part in whole.values() for name, one in part.named_spectra if one is not None},
+>>>>>>> 9f44bce9 (wip2)
     )
 
 

@@ -32,7 +32,9 @@ class Window:
         self._predictor = Predictor(question.experiment, question.keys, observation.select_parts(self.rows))
         self._start = np.array([unknown.start for unknown in question.unknowns])
         self._scale = np.array([unknown.scale for unknown in question.unknowns])
-        self._measured = observation.values[: self.rows] / observation.noise
+        parts = self._predictor.parts
+        whole = {name: part.values for name, part in parts.items()}
+        self._measured = self._over_noise(whole)
         self.valid = np.isfinite(self._measured)
 
     @property
@@ -51,9 +53,8 @@ class Window:
             InputError: The model rejects a value.
             SimulationError: The state became non-finite.
         """
-        observation = self.question.observation
         prediction = self._predictor.predict(self.values(z))
-        return observation.tabulate(prediction.values, self.rows) / observation.noise
+        return self._over_noise(prediction.values)
 
     def residuals(self, z: np.ndarray) -> np.ndarray:
         """Return measured minus predicted over the noise, 0 for lost samples, shape (rows, channels)."""
@@ -90,10 +91,15 @@ class Window:
 
     def slopes_by_keys(self, z: np.ndarray) -> np.ndarray:
         """Return the slopes by each value alone, in the predictor's own steps, shape (rows, channels, unknowns)."""
-        observation = self.question.observation
         slopes = self._predictor.derivatives(self.values(z)).slopes
-        columns = [observation.tabulate(one, self.rows) * s for one, s in zip(slopes, self._scale, strict=True)]
-        return np.nan_to_num(np.stack(columns, axis=-1) / observation.noise[:, None])
+        columns = [self._over_noise(one) * scale for one, scale in zip(slopes, self._scale, strict=True)]
+        return np.nan_to_num(np.stack(columns, axis=-1))
+
+    def _over_noise(self, values: dict[str, np.ndarray]) -> np.ndarray:
+        """Return values by group as one table over the noise, filtered so that it is white, shape (rows, channels)."""
+        observation, parts = self.question.observation, self._predictor.parts
+        white = {name: parts[name].whiten(one) for name, one in values.items()}
+        return observation.tabulate(white, self.rows) / observation.noise
 
     def _side(self, z: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a point near z and the prediction there; z itself if the model rejects the point."""

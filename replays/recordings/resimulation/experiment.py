@@ -41,6 +41,7 @@ class Experiment:
         first_s: Simulated time at which the recording begins [s].
         begin: Initial state of a log from a running rig; None: the scene's own start at time 0.
         unsure: Standard deviation of values without their own channel, by key, in their unit.
+        imported: Whether it is that of a log of another system.
     """
 
     scene: Scene
@@ -48,6 +49,7 @@ class Experiment:
     first_s: float = 0.0
     begin: MotionStart | None = None
     unsure: Mapping[str, float] = field(default_factory=dict)
+    imported: bool = False
 
     @classmethod
     def from_recording(cls, recording: Recording) -> Self:
@@ -73,7 +75,8 @@ class Experiment:
         first_s = min(float(stream.first_time_s) for stream in streams)
         begin = _initial_state(recording, scene, first_s) if starts_while_running(recording) else None
         unsure = recording.scene.get("import", {}).get("unsure", {})
-        return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=unsure)
+        return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=unsure,
+                   imported=is_imported(recording))  # fmt: skip
 
     def with_changes(self, changes: dict[str, Any]) -> Experiment:
         """Return the experiment with other values of scene or parameters, by dotted key, each in its own unit.

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
+from replays.estimate.whitening import NoiseSpectrum, whiten_rows
 from replays.recordings.resimulation.experiment import Experiment
 from rig.base.errors import InputError
 from rig.channels.formula import Formulas
@@ -32,6 +33,9 @@ _RANGE_MARGIN = 16.0
 _MIN_NOISE_STEPS = 2.0
 """Noise in converter steps below which rounding is not random, so that the floor is a bound and not a deviation."""
 _CHUNK_S = 0.1
+_LOG_ROW_TICKS = 10
+"""Largest row spacing for a log [ticks]: an impact contains frequencies above half of the rig's own row rate, which the
+filters of a log never had to pass."""
 _POLYNOMIAL_ROWS = 3
 """Rows after a sample that a polynomial through six of them may need."""
 _LOW_PASS_SETTLING_S = 0.02
@@ -55,6 +59,7 @@ class Measured:
         floor: Standard deviation of noise and rounding of each channel [its unit], shape (channels,).
         random: True if the floor is noise, False if it is a bound of the rounding, shape (channels,).
         ideal: True if the scene had no filters and no noise.
+        spectra: Spectrum of the noise of each channel, None if it is white; empty if all are.
         version: Version of the channel table.
     """
 
@@ -67,6 +72,7 @@ class Measured:
     random: np.ndarray
     ideal: bool
     version: int = 2
+    spectra: tuple[NoiseSpectrum | None, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -125,8 +131,31 @@ class Measured:
         kept = [c for c, name in enumerate(self.names) if name in names]
         return replace(
             self, channels=tuple(self.channels[c] for c in kept), values=self.values[:, kept], floor=self.floor[kept],
-            random=self.random[kept],
+            random=self.random[kept], spectra=tuple(self.spectra[c] for c in kept) if self.spectra else (),
         )  # fmt: skip
+
+    @property
+    def named_spectra(self) -> tuple[tuple[str, NoiseSpectrum | None], ...]:
+        """Each channel's name, and the spectrum of its noise; None if that is white."""
+        return tuple(zip(self.names, self.spectra or [None] * len(self.names), strict=True))
+
+    def with_spectra(self, spectra: Mapping[str, NoiseSpectrum]) -> Measured:
+        """Return the channels with the spectra of their noise, by name."""
+        return replace(self, spectra=tuple(spectra.get(name) for name in self.names))
+
+    def with_slow_floor(self) -> Measured:
+        """Return the channels with floors of white noise as large as their noise is at low frequencies."""
+        if not any(self.spectra):
+            return self
+        density = np.array([1.0 if one is None else one.low for one in self.spectra])
+        return replace(self, floor=self.floor * np.sqrt(density), spectra=())
+
+    def whiten(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the first rows filtered so that the noise is white, at its floor, shape (n, channels)."""
+        if not any(self.spectra):
+            return values
+        index = self.index[: len(values)]
+        return np.column_stack([whiten_rows(v, one, index) for v, one in zip(values.T, self.spectra, strict=True)])
 
     @cached_property
     def fine(self) -> tuple[Channel, ...]:
@@ -433,6 +462,7 @@ def simplify(experiment: Experiment) -> Experiment:
         return experiment
     groups = (experiment.scene.channels or rig_table()).groups.values()
     fewest = min(groups, key=lambda group: len(group.channels))
+    row_ticks = experiment.simulation().row_ticks
     return experiment.without_faults().with_changes(
         {
             "engine.companion": False,
@@ -440,6 +470,6 @@ def simplify(experiment: Experiment) -> Experiment:
             "engine.tolerance": experiment.scene.engine.tolerance,
             "sensors.groups": [fewest.name],
             "sensors.chain": "ideal",
-            "sensors.rate_hz": TICK_RATE_HZ // experiment.simulation().row_ticks,
+            "sensors.rate_hz": TICK_RATE_HZ // (min(row_ticks, _LOG_ROW_TICKS) if experiment.imported else row_ticks),
         }
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -301,7 +301,23 @@ class Predictor:
         # Contacts after the window do not count.
         end_s = math.ceil(round((last_s + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
         changed = with_values(self._experiment, {**values, "duration_s": end_s})
+        if late := self._find_lateness(values):
+            parts = {name: replace(part, times_s=part.times_s - late(part.times_s)) for name, part in parts.items()}
         return predict(changed, parts, lead_ins=self._lead_ins)
+
+    def _find_lateness(self, values: Mapping[str, float]) -> Callable[[np.ndarray], np.ndarray] | None:
+        """Return by how much signals after a pulse of a fraction of a tick come later than after one of whole ticks [s].
+
+        With the same impulse, a longer pulse acts later by half of the difference. Impacts show a fraction of a tick.
+        """
+        for key in values:
+            if key.endswith(".duration_ms"):
+                at_key = key.replace(".duration_ms", ".at_s")
+                at_s = values[at_key] if at_key in values else get_value(self._experiment, at_key)
+                length_s = 1e-3 * values[key]
+                late_s = 0.5 * (length_s - max(1, round(length_s / _TICK_S)) * _TICK_S)
+                return lambda times_s: np.where(times_s > at_s, late_s, 0.0)
+        return None
 
 
 def to_model_clock(

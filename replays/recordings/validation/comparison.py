@@ -35,8 +35,14 @@ from replays.recordings.validation.explanations.signals import SignalFault, edge
 from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import CONTACT, PHASES, Phase
+<<<<<<< HEAD
 from replays.recordings.validation.statistics import StatisticResult, make_quantity_reader, perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
+=======
+from replays.recordings.validation.statistics import perturbed, statistics
+from replays.recordings.validation.tolerance import Tolerated, Uncertainty, tolerate
+from replays.recordings.validation.trajectory import foreseeable_s, residuals, scaled
+>>>>>>> 9f44bce9 (wip2)
 from replays.recordings.validation.truth import judge_truth, recorded_truth
 from rig.base.errors import InputError, Words
 from rig.base.wire import TRUTH
@@ -80,7 +86,8 @@ def validate(
         experiment = experiment.without_faults()
     again = _resimulate(recording, experiment, criteria, step)
     begin, end, reason = _window(again)
-    trajectory = residuals(again.parts, again.nominal, again.others, again.criteria, end_s=end)
+    scaled_residuals, tolerated = again.scaled_residuals(end)
+    trajectory = residuals(again.parts, scaled_residuals, again.criteria)
     tables = recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
     truth = [] if criteria.floating else judge_truth(tables, again.nominal, again.others[0], criteria, end_s=end)
     doubts = [*recording.doubts, *parameter_doubts(recording)]
@@ -112,8 +119,12 @@ def validate(
         or sum(stream.lost - stream.declared for stream in recording.streams.values()),
         explained=None, fitted=again.fitted, floating=criteria.floating,
         parts=again.parts, nominal=again.nominal, files=len(recording.parts), **_contact(again, phases, end),
+<<<<<<< HEAD
         doubts=tuple(doubts), faults=again.faults, complete=recording.complete,
         budgets=_make_budgets(again, phases, judged, step) if budget else (),
+=======
+        doubts=tuple(doubts), faults=again.faults, complete=recording.complete, tolerated=tuple(tolerated),
+>>>>>>> 9f44bce9 (wip2)
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     # Without the truth a number of the model may be the cause, if the difference begins with the recording.
@@ -213,7 +224,7 @@ class _Resimulation:
         criteria: Criteria, widened for an imported log.
         parts: Recorded channels, on the model's clock.
         nominal: Prediction.
-        others: Equally valid predictions: of another build, or of other fits and models.
+        uncertainties: Equally valid predictions: of another build, or of other fits and models.
         bits: Comparison of bits by key; empty for an imported log.
         tuned: Fit of an imported log.
         fitted: Fitted numbers, of any recording.
@@ -228,7 +239,7 @@ class _Resimulation:
     criteria: Criteria
     parts: dict[str, Measured]
     nominal: Prediction
-    others: tuple[Prediction, ...]
+    uncertainties: tuple[Uncertainty, ...]
     bits: dict[str, StreamBits]
     tuned: Tuned | None
     fitted: tuple[Fitted, ...] = ()
@@ -237,6 +248,21 @@ class _Resimulation:
     unjudged: tuple[str, ...] = ()
     own: tuple[Explanation, ...] = ()
     same_motion: bool = False
+
+    @property
+    def others(self) -> tuple[Prediction, ...]:
+        """Equally valid predictions."""
+        return tuple(one.prediction for one in self.uncertainties)
+
+    def scaled_residuals(self, end_s: float) -> tuple[dict[str, np.ndarray], list[Tolerated]]:
+        """Return the residuals over their floors up to an end [s], by group, and what a log's uncertainty explains."""
+        if self.tuned is not None:
+            return tolerate(self.parts, self.nominal, self.uncertainties, end_s=end_s)
+        rows = {name: slice(part.count_rows(end_s)) for name, part in self.parts.items()}
+        return {
+            name: scaled(part, self.nominal.values[name][rows[name]], [o.values[name][rows[name]] for o in self.others])
+            for name, part in self.parts.items()
+        }, []
 
 
 def _resimulate(
@@ -260,7 +286,7 @@ def _resimulate(
     nominal = predict(experiment, parts, follow=bits.follow)
     quick = simplify(experiment)
     step("perturbed, to find the predictable part")
-    others = [predict(perturbed(quick, rules.parameters, rules.perturbation), parts)]
+    moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
     determined = floated is not None and all(one.is_determined for one in floated.fitted)
     members = _draw_predictions([floated], parts, criteria) if floated is not None and determined else ()
     streams = bits.finish()
@@ -278,8 +304,9 @@ def _resimulate(
         own = own_faults(
             parts, nominal, bits.differences, recording.edges(), bits.edges_s(), partial(predict, experiment), step
         )  # fmt: skip
+    valid = (Uncertainty("another build", moved), *(Uncertainty("fit", one) for one in members))
     return _Resimulation(
-        quick, criteria, parts, nominal, (*others, *members), streams, None, floated.fitted if floated else (), members,
+        quick, criteria, parts, nominal, valid, streams, None, floated.fitted if floated else (), members,
         own=tuple(own), same_motion=same,
     )  # fmt: skip
 
@@ -313,16 +340,22 @@ def _resimulate_log(
     }
     nominal = tuned.predict(parts)
     step("perturbed, and with equally valid models, to find the predictable part")
-    others = [tuned.undo_last_growth().predict(parts)]
+    parts = {name: part.with_spectra(tuned.spectra) for name, part in parts.items()}
+    uncertainties = [Uncertainty("fit", tuned.undo_last_growth().predict(parts))]
     models = [tuned, *(tuned.with_changes(variant.set) for variant in rules.variants)]
-    others += [model.predict(parts) for model in models[1:]]
-    others += [tuned.predict({name: part.with_corner_factor(rules.bandwidth) for name, part in parts.items()})]
+    uncertainties += [
+        Uncertainty(", ".join(f"{key} = {value}" for key, value in variant.set.items()), model.predict(parts))
+        for variant, model in zip(rules.variants, models[1:], strict=True)
+    ]
+    corners = tuned.predict({name: part.with_corner_factor(rules.bandwidth) for name, part in parts.items()})
+    uncertainties += [Uncertainty(f"corner {rules.bandwidth - 1.0:+.1%}", corners, each=True)]
     gains = {name: v + rules.calibration * (v - v.mean(axis=0)) for name, v in nominal.values.items()}
-    others += [replace(nominal, values=gains)]
+    uncertainties += [Uncertainty(f"calibration {rules.calibration:+.1%}", replace(nominal, values=gains), each=True)]
     until_s = first_command_s(tuned.baseline) or math.inf
     if np.count_nonzero(recording.edges() < until_s) < 2:
         # The phase of the pulses is unknown: a pulse is possible at any time.
-        others.insert(1, _replace_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
+        pulses = _replace_pulses(parts, nominal, lambda pulses: 1.0 - pulses)
+        uncertainties.insert(1, Uncertainty("phase of the pulses", pulses))
     faults = signal_faults(whole, until_s)
     key = next((name for name, part in whole.items() if "keyphasor" in part.names), min(whole))
     mapped = "keyphasor" in recording.scene["import"]["mapping"]
@@ -335,7 +368,7 @@ def _resimulate_log(
         unjudged=tuple(name for name, part in whole.items() if not is_quiet(part, until_s)),
         quick=simplify(tuned.experiment), criteria=criteria.for_log(),
         parts=tuned.to_model_clock(parts),
-        nominal=nominal, others=tuple(others), bits={}, tuned=tuned,
+        nominal=nominal, uncertainties=tuple(uncertainties), bits={}, tuned=tuned,
     )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from replays.recordings.validation.explanations.budget import Budget
 from replays.recordings.validation.explanations.signals import SignalFault
 from replays.recordings.validation.phases import QUANTITIES, Phase
 from replays.recordings.validation.statistics import StatisticResult
+from replays.recordings.validation.tolerance import Tolerated
 from replays.recordings.validation.trajectory import ChannelResidual
 from replays.recordings.validation.truth import TruthResult
 from rig.base.outcome import Outcome
@@ -82,7 +83,11 @@ class Validation:
         doubts: Inconsistencies within the recording; with any of them the validation fails.
         complete: Whether the recording was finished.
         contact_s: First contact of a log, if the trajectory ends before it [s]; otherwise None.
+<<<<<<< HEAD
         budgets: Uncertainties of fitted numbers and quantities of a log, on request.
+=======
+        tolerated: Parts of a log's residuals that what is uncertain explains.
+>>>>>>> 9f44bce9 (wip2)
         due_s: The same if the trajectory would have reached it with a valid model.
     """
 
@@ -111,6 +116,7 @@ class Validation:
     doubts: tuple[str, ...] = ()
     contact_s: float | None = None
     due_s: float | None = None
+    tolerated: tuple[Tolerated, ...] = ()
     complete: bool = True
     budgets: tuple[Budget, ...] = ()
 

@@ -240,6 +240,7 @@ def _about(validation: Validation) -> list[Row]:
     ]
     rows += [Row(("changed", f"{key} = {value}")) for key, value in validation.changes.items()]
     rows += [Row(("fitted first", one.line)) for one in validation.fitted]
+    rows += [Row(("tolerated", one.line)) for one in validation.tolerated]
     if validation.calibration:
         rows.append(Row(("calibration", validation.calibration_line.removesuffix("; the report says how"))))
     return rows

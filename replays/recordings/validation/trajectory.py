@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,27 +108,24 @@ def floors(part: Measured, values: np.ndarray, others: Sequence[np.ndarray] = ()
 
 def scaled(part: Measured, values: np.ndarray, others: Sequence[np.ndarray] = ()) -> np.ndarray:
     """Return the residuals over the floor, shape (n, channels); arguments as of `floors`."""
-    return (part.values[: len(values)] - values) / floors(part, values, others)
+    return part.whiten(part.values[: len(values)] - values) / floors(part, values, others)
 
 
 def residuals(
-    parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], criteria: Criteria, *, end_s: float
+    parts: dict[str, Measured], scaled_residuals: Mapping[str, np.ndarray], criteria: Criteria
 ) -> list[ChannelResidual]:
     """Judge every channel within the window.
 
     Args:
         parts: Recorded channels.
-        nominal: Prediction.
-        others: Equally valid predictions.
+        scaled_residuals: Residuals over the floors in the window, by group, each shape (n, channels).
         criteria: The limits.
-        end_s: End of the window [s].
     """
     judged = []
-    for name, part in parts.items():
-        n = part.count_rows(end_s)
-        if n == 0:
+    for name, z in scaled_residuals.items():
+        part = parts[name]
+        if len(z) == 0:
             continue
-        z = scaled(part, nominal.values[name][:n], [other.values[name][:n] for other in others])
         for c, channel in enumerate(part.channels):
             criterion = criteria.find_trajectory(channel.name)
             judged.append(_judge(part, c, z[:, c], criterion))

@@ -52,6 +52,7 @@ def sensor_faults(
         others: Equally valid predictions.
         from_s: Approximate first difference, after which a fault that begins within the run is fitted [s].
     """
+    parts = {name: part.with_slow_floor() for name, part in parts.items()}
     if math.isfinite(from_s):
         from_s = _find_onset_s(parts, nominal, from_s, end_s)
     shown = []

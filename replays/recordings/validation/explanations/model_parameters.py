@@ -63,7 +63,10 @@ def explain_by_parameters(
 
     def over_floors(values: dict[str, np.ndarray]) -> np.ndarray:
         return np.concatenate(
-            [(values[name][: len(by)] / by)[:, smooth_columns(kept[name])].ravel() for name, by in floor.items()]
+            [
+                (kept[name].whiten(values[name][: len(by)]) / by)[:, smooth_columns(kept[name])].ravel()
+                for name, by in floor.items()
+            ]
         )
 
     z = over_floors({name: part.values - nominal.values[name][: len(part.times_s)] for name, part in kept.items()})
