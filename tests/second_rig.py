@@ -250,8 +250,9 @@ def apply_low_pass(kind: str, values: np.ndarray, rate_hz: float, corner_hz: flo
     from scipy import signal
 
     if kind in ("fir", "fir-compensated", "sinc"):
-        average = np.ones(round(0.26193 * rate_hz / corner_hz) + 1)
-        average[[0, -1]] = 0.5
+        length = 0.26193 * rate_hz / corner_hz
+        average = np.ones(int(length) + 2)
+        average[[0, -1]] = 0.5 * (length % 1.0)
         average /= average.sum()
         half = round(1.6e-3 * rate_hz)
         taps = signal.firwin(2 * half + 1, corner_hz, fs=rate_hz)

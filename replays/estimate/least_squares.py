@@ -58,6 +58,16 @@ def solve_normal(square: np.ndarray, side: np.ndarray) -> np.ndarray:
     return size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
 
 
+def solve_bounded(square: np.ndarray, side: np.ndarray, largest: float) -> np.ndarray:
+    """Solve the normal equations square x = side, shapes (k, k) and (k,), with no value larger in size than a bound."""
+    from scipy.optimize import lsq_linear
+
+    if not len(side):
+        return side
+    upper = np.linalg.cholesky(square).T
+    return lsq_linear(upper, np.linalg.solve(upper.T, side), bounds=(-largest, largest)).x
+
+
 def column_sizes(matrix: np.ndarray) -> np.ndarray:
     """Return the rms of each column, shape (k,), with a lower limit that keeps squared ratios finite."""
     return np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-140)

@@ -1,13 +1,33 @@
-"""Spectra of real signals, filters and correlations, and interpolation of a peak between samples.
+"""Spectra of real signals and of noise, filters and correlations, and interpolation of a peak between samples.
+
+Noise of a measuring chain is rarely white: it has lines of the mains, and its density rises towards low frequencies. If
+residuals are filtered so that such noise becomes white, sums of their squares, means over a stretch and least squares
+have the statistics that they have for white noise. The filter is causal: a difference does not appear before its time.
 
 The two-sided spectrum of an orbit x + j y is `rig.channels.orbit.full_spectrum`.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+
+_SEGMENT_ROWS = 8192
+"""Most samples of a segment of the spectrum, a power of two."""
+_FEWEST_SEGMENTS, _SHORTEST = 8, 64
+"""Fewest segments, and their fewest samples."""
+_DOUBT = 4.0
+"""Standard deviations of a line's estimate by which it must exceed white noise to be coloured."""
+_EXTRAPOLATED = 4.0
+"""Density at frequency 0 over that of the first line: that of a random walk at half of its frequency."""
+_LINE_NEIGHBOURS = 15
+"""Frequencies of a running median, which a line does not affect."""
+_SETTLED = 0.99
+"""Part of the filter's energy after which its start has no effect."""
 
 
 def spectrum(values: np.ndarray, size: int | None = None) -> np.ndarray:
@@ -106,3 +126,119 @@ def parabola_top(before: float, middle: float, after: float) -> tuple[float, flo
     if not bend < 0.0:
         return 0.0, 0.0
     return 0.5 * (before - after) / bend, -((before - after) ** 2) / (8.0 * bend)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSpectrum:
+    """Spectrum of a noise relative to white noise of a channel's floor, never below it.
+
+    Attributes:
+        density: Power at each frequency over that of the white floor, from 0 up to the sample rate, shape (n,).
+    """
+
+    density: np.ndarray
+
+    @classmethod
+    def estimate(cls, noise: np.ndarray) -> NoiseSpectrum | None:
+        """Estimate the spectrum of a noise over its floor, shape (n,); None if it is white, or too short to tell.
+
+        Between lines the density is a running median, so that a line stands alone. A density that white noise could
+        have by chance counts as white.
+        """
+        from scipy.ndimage import median_filter
+        from scipy.signal import detrend, welch
+
+        size = min(_SEGMENT_ROWS, 1 << max(0, len(noise) // (_FEWEST_SEGMENTS // 2 + 1)).bit_length() >> 1)
+        if size < _SHORTEST:
+            return None
+        one_sided = welch(detrend(noise, type="constant"), window="hann", nperseg=size, detrend=False)[1] / 2.0
+        segments = 2.0 * len(noise) / size - 1.0
+        # Segments of a Hann window with an overlap of a half are nearly independent.
+        limit = 1.0 + _DOUBT / np.sqrt(segments)
+        smooth = median_filter(one_sided, 5, mode="nearest")
+        density = np.where(one_sided > limit * np.maximum(smooth, 1.0), one_sided, smooth)
+        density[:2] = one_sided[1:3].max()
+        density = np.where(density > limit, density, 1.0)
+        if density.max() <= limit:
+            return None
+        density[0] *= _EXTRAPOLATED
+        return cls(np.concatenate([density, density[-2:0:-1]]))
+
+    def fold(self, every: int) -> NoiseSpectrum:
+        """Return the spectrum of every n-th sample."""
+        size = len(self.density) // every * every
+        places = np.arange(size) * len(self.density) // size
+        return NoiseSpectrum(self.density[places].reshape(every, -1).mean(axis=0)) if every > 1 else self
+
+    @property
+    def low(self) -> float:
+        """Density of slow parts: the mean over the lowest sixty-fourth of the frequencies."""
+        return float(self.density[: max(2, len(self.density) // 128)].mean())
+
+    @property
+    def excess(self) -> float:
+        """RMS of the noise beyond white noise, over that of white noise."""
+        return float(np.sqrt(self.density.mean() - 1.0))
+
+    @property
+    def largest_line(self) -> float:
+        """Largest RMS of a single line over that of white noise."""
+        from scipy.ndimage import median_filter
+
+        half = self.density[2 : len(self.density) // 2]
+        above = np.maximum(half - median_filter(half, _LINE_NEIGHBOURS, mode="nearest"), 0.0)
+        return float(np.sqrt(2.0 * np.convolve(above, np.ones(3)).max() / len(self.density)))
+
+    @cached_property
+    def response(self) -> np.ndarray:
+        """Impulse response of the whitening filter, which has the least delay, shape (n,)."""
+        size = len(self.density)
+        cepstrum = np.fft.ifft(-0.5 * np.log(self.density)).real
+        cepstrum[1 : (size + 1) // 2] *= 2.0
+        cepstrum[size // 2 + 1 :] = 0.0
+        return np.fft.ifft(np.exp(np.fft.fft(cepstrum))).real
+
+    @cached_property
+    def first_gains(self) -> np.ndarray:
+        """Factors that give the filter's first outputs, before it has settled, the variance of white noise."""
+        energy = np.cumsum(self.response**2)
+        rows = 1 + int(np.searchsorted(energy, _SETTLED * energy[-1]))
+        size = len(self.density)
+        started = np.tril(np.ones((rows, rows))) * self.response[:rows]
+        return 1.0 / np.sqrt((np.abs(np.fft.fft(started, size, axis=1)) ** 2 * self.density).mean(axis=1))
+
+    def colour(self, white: np.ndarray) -> np.ndarray:
+        """Return white noise filtered so that it has this spectrum, shape (n,)."""
+        half = self.density[: len(self.density) // 2 + 1]
+        lines = np.fft.rfft(white)
+        places = np.linspace(0.0, len(half) - 1.0, len(lines))
+        return np.fft.irfft(lines * np.sqrt(np.interp(places, np.arange(len(half)), half)), len(white))
+
+    def whiten(self, values: np.ndarray) -> np.ndarray:
+        """Return values over the floor filtered so that the noise is white, shape (n,), from rest before the first."""
+        from scipy.signal import oaconvolve
+
+        filtered = oaconvolve(values, self.response[: len(values)])[: len(values)]
+        gains = self.first_gains[: len(values)]
+        filtered[: len(gains)] *= gains
+        return filtered
+
+
+def whiten_rows(values: np.ndarray, spectrum: NoiseSpectrum | None, index: np.ndarray) -> np.ndarray:
+    """Return values over the floor, whitened in every stretch of equally spaced rows.
+
+    Args:
+        values: Values over the floor, shape (n,).
+        spectrum: Spectrum of the noise at a spacing of 1; None: white.
+        index: Number of each row, shape (n,).
+    """
+    if spectrum is None or not len(values):
+        return values
+    steps = np.diff(index)
+    starts = [0, *(np.flatnonzero(np.diff(steps)) + 2).tolist(), len(values)]
+    whitened = np.empty(len(values))
+    for begin, end in pairwise(starts):
+        every = int(index[begin + 1] - index[begin]) if end - begin > 1 else 1
+        folded = spectrum.fold(every) if every > 0 else spectrum
+        whitened[begin:end] = folded.whiten(values[begin:end])
+    return whitened

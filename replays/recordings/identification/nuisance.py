@@ -15,7 +15,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.estimate.intervals import draw_normal, format_with_half_width
-from replays.estimate.whitening import NoiseSpectrum
+from replays.estimate.spectra import NoiseSpectrum
 from replays.recordings.identification.agreement import (
     MAX_PRIOR_DEVIATION,
     ChannelState,
@@ -29,9 +29,9 @@ from replays.recordings.identification.agreement import (
     split_channels,
     subtract_mean,
 )
-from replays.recordings.identification.noise import with_spectra
 from replays.recordings.identification.request import first_command_s, fit_unit, observe
 from replays.recordings.resimulation.experiment import PICKUP_S, Experiment
+from replays.recordings.resimulation.noise import with_spectra
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.resimulation.sensitivity import (
     ANGLE,
@@ -153,11 +153,8 @@ class Tuned:
         end_s: End of the samples of the fit [s].
         longest_s: End of the samples if the model had explained all of them [s].
         scales: Residual rms over noise of each channel, at least 1.
-<<<<<<< HEAD
-        parts: Samples of the fit.
-=======
         spectra: Spectrum of the noise of each channel that is not white, by name.
->>>>>>> 9f44bce9 (wip2)
+        parts: Samples of the fit.
     """
 
     baseline: Experiment
@@ -170,11 +167,8 @@ class Tuned:
     end_s: float
     longest_s: float
     scales: dict[str, float]
-<<<<<<< HEAD
-    parts: dict[str, Measured] = field(repr=False)
-=======
     spectra: dict[str, NoiseSpectrum]
->>>>>>> 9f44bce9 (wip2)
+    parts: dict[str, Measured] = field(repr=False)
 
     def to_model_clock(self, parts: dict[str, Measured]) -> dict[str, Measured]:
         """Return channels of the log on the model's clock."""
@@ -379,11 +373,8 @@ def tune(
         end_s=fit.end_s,
         longest_s=end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), fit.scales, strict=True)),
-<<<<<<< HEAD
-        parts={name: part.select_until(fit.end_s) for name, part in whole.items()},
-=======
         spectra={name: one for part in whole.values() for name, one in part.named_spectra if one is not None},
->>>>>>> 9f44bce9 (wip2)
+        parts={name: part.select_until(fit.end_s) for name, part in whole.items()},
     )
 
 
@@ -484,7 +475,7 @@ def _fit_windows(
     first_s, every = _pulse_time_s(baseline), [name not in without for part in whole.values() for name in part.names]
     values = np.array([get_value(baseline, key) for key in wanted])
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
-    jackknife = np.zeros(len(values))
+    jackknife, rows = np.zeros(len(values)), list[int]()
     for n, length in enumerate(_WINDOWS_S, 1):
         progress(f"{len(wanted)} values, window {n} of {len(_WINDOWS_S)}, to {first_s + length:.3f} s")
         parts = {name: part.select_until(first_s + length) for name, part in whole.items()}
@@ -507,9 +498,11 @@ def _fit_windows(
         ]  # fmt: skip
         if scales and unseen and _is_worse(now, scales):
             fit, here, now = fitted(search_restarts(predictor, values, unseen, every))
-        if _is_worse(now, scales):
+        # Sharp signals of a contact that the model does not explain must not bend the motion before it.
+        early = [max(1.0, rms(z[:n])) for z, n in zip(here.apart, rows, strict=False)]
+        if _is_worse(now, scales) or any(b > _MAX_RMS_GROWTH * a for a, b in zip(scales, early, strict=False)):
             break  # the model does not explain the longer window, which is for the judgement to report
-        scales = now
+        scales, rows = now, [len(z) for z in here.apart]
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
         moves.append(fit - values)
         covariance, values = np.linalg.inv(square + np.diag(priors[1] ** -2.0)), fit

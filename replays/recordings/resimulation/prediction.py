@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
-from replays.estimate.whitening import NoiseSpectrum, whiten_rows
+from replays.estimate.spectra import NoiseSpectrum, whiten_rows
 from replays.recordings.resimulation.experiment import Experiment
 from rig.base.errors import InputError
 from rig.channels.formula import Formulas
@@ -143,12 +143,26 @@ class Measured:
         """Return the channels with the spectra of their noise, by name."""
         return replace(self, spectra=tuple(spectra.get(name) for name in self.names))
 
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of the noise of each channel, with its spectrum, shape (channels,)."""
+        excess = [0.0 if one is None else one.excess for _, one in self.named_spectra]
+        return self.floor * np.hypot(1.0, excess)
+
     def with_slow_floor(self) -> Measured:
         """Return the channels with floors of white noise as large as their noise is at low frequencies."""
         if not any(self.spectra):
             return self
         density = np.array([1.0 if one is None else one.low for one in self.spectra])
         return replace(self, floor=self.floor * np.sqrt(density), spectra=())
+
+    def draw_noise(self, generator: np.random.Generator, n: int) -> np.ndarray:
+        """Return random noise with the channels' floors and spectra, shape (n, channels)."""
+        white = generator.standard_normal((n, len(self.names)))
+        for c, (_, spectrum) in enumerate(self.named_spectra):
+            if spectrum is not None:
+                white[:, c] = spectrum.colour(white[:, c])
+        return self.floor * white
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Return values of the first rows filtered so that the noise is white, at its floor, shape (n, channels)."""

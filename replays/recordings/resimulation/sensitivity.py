@@ -306,7 +306,7 @@ class Predictor:
         return predict(changed, parts, lead_ins=self._lead_ins)
 
     def _find_lateness(self, values: Mapping[str, float]) -> Callable[[np.ndarray], np.ndarray] | None:
-        """Return by how much signals after a pulse of a fraction of a tick come later than after one of whole ticks [s].
+        """Return how much later signals come after a pulse of a fraction of a tick than after one of whole ticks [s].
 
         With the same impulse, a longer pulse acts later by half of the difference. Impacts show a fraction of a tick.
         """

@@ -35,18 +35,22 @@ from replays.recordings.validation.explanations.signals import SignalFault, edge
 from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import CONTACT, PHASES, Phase
-<<<<<<< HEAD
 from replays.recordings.validation.statistics import StatisticResult, make_quantity_reader, perturbed, statistics
-from replays.recordings.validation.trajectory import foreseeable_s, residuals
-=======
-from replays.recordings.validation.statistics import perturbed, statistics
-from replays.recordings.validation.tolerance import Tolerated, Uncertainty, tolerate
-from replays.recordings.validation.trajectory import foreseeable_s, residuals, scaled
->>>>>>> 9f44bce9 (wip2)
+from replays.recordings.validation.trajectory import (
+    ChannelResidual,
+    Tolerated,
+    Uncertainty,
+    foreseeable_s,
+    residuals,
+    scaled,
+    tolerate,
+)
 from replays.recordings.validation.truth import judge_truth, recorded_truth
 from rig.base.errors import InputError, Words
 from rig.base.wire import TRUTH
 
+_CONTACT_MARGIN_S = 1e-3
+"""Time before the first contact in the signals by which a difference is earlier [s]: that of filters."""
 _MAX_CHECKED = 3
 """Largest number of named numbers of the model that are checked by the phases."""
 
@@ -86,8 +90,7 @@ def validate(
         experiment = experiment.without_faults()
     again = _resimulate(recording, experiment, criteria, step)
     begin, end, reason = _window(again)
-    scaled_residuals, tolerated = again.scaled_residuals(end)
-    trajectory = residuals(again.parts, scaled_residuals, again.criteria)
+    trajectory, tolerated = again.judge_trajectory(end)
     tables = recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
     truth = [] if criteria.floating else judge_truth(tables, again.nominal, again.others[0], criteria, end_s=end)
     doubts = [*recording.doubts, *parameter_doubts(recording)]
@@ -119,12 +122,8 @@ def validate(
         or sum(stream.lost - stream.declared for stream in recording.streams.values()),
         explained=None, fitted=again.fitted, floating=criteria.floating,
         parts=again.parts, nominal=again.nominal, files=len(recording.parts), **_contact(again, phases, end),
-<<<<<<< HEAD
-        doubts=tuple(doubts), faults=again.faults, complete=recording.complete,
-        budgets=_make_budgets(again, phases, judged, step) if budget else (),
-=======
         doubts=tuple(doubts), faults=again.faults, complete=recording.complete, tolerated=tuple(tolerated),
->>>>>>> 9f44bce9 (wip2)
+        budgets=_make_budgets(again, phases, judged, step) if budget else (),
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     # Without the truth a number of the model may be the cause, if the difference begins with the recording.
@@ -146,13 +145,13 @@ def validate(
         ))  # fmt: skip
     if not firsts:
         return validation
+    again = again.select_causes(min(firsts), touched)
     step("what explains the difference")
     if again.tuned is None:
-        explained = attribute(
-            again.quick, again.parts, again.nominal, again.criteria.attribution, from_s=min(firsts), own=again.own,
-            step=step,
-        )  # fmt: skip
-        return replace(validation, explained=explained)
+        rules = again.criteria.attribution
+        return replace(validation, explained=attribute(
+            again.quick, again.parts, again.nominal, rules, from_s=min(firsts), own=again.own, step=step
+        ))  # fmt: skip
     explained = _explain_log(again, from_s=min(firsts), end_s=end, touching=touching)
     late_s = find_common_delay(explained.ranked, again.parts)
     if late_s:
@@ -254,15 +253,27 @@ class _Resimulation:
         """Equally valid predictions."""
         return tuple(one.prediction for one in self.uncertainties)
 
-    def scaled_residuals(self, end_s: float) -> tuple[dict[str, np.ndarray], list[Tolerated]]:
-        """Return the residuals over their floors up to an end [s], by group, and what a log's uncertainty explains."""
+    def select_causes(self, from_s: float, touched_s: float) -> _Resimulation:
+        """Return the same with the candidates that can cause a log's difference, not contact before the first one."""
+        if self.tuned is None or not from_s < touched_s - _CONTACT_MARGIN_S < math.inf:
+            return self
+        rules = self.criteria.attribution.before_contact()
+        return replace(self, criteria=self.criteria.model_copy(update={"attribution": rules}))
+
+    def judge_trajectory(self, end_s: float) -> tuple[list[ChannelResidual], list[Tolerated]]:
+        """Return the residuals of every channel up to an end [s], and what a log's uncertainty explains of them."""
+        tolerated = []
         if self.tuned is not None:
-            return tolerate(self.parts, self.nominal, self.uncertainties, end_s=end_s)
-        rows = {name: slice(part.count_rows(end_s)) for name, part in self.parts.items()}
-        return {
-            name: scaled(part, self.nominal.values[name][rows[name]], [o.values[name][rows[name]] for o in self.others])
-            for name, part in self.parts.items()
-        }, []
+            z, tolerated = tolerate(self.parts, self.nominal, self.uncertainties, end_s=end_s)
+        else:
+            rows = {name: slice(part.count_rows(end_s)) for name, part in self.parts.items()}
+            z = {
+                name: scaled(
+                    part, self.nominal.values[name][rows[name]], [o.values[name][rows[name]] for o in self.others]
+                )
+                for name, part in self.parts.items()
+            }
+        return residuals(self.parts, z, self.criteria), tolerated
 
 
 def _resimulate(

@@ -161,7 +161,14 @@ class Attribution(_Section):
     """Smallest difference of the explained parts by which two candidates are distinguished."""
     enough: Positive
     """Smallest part of the residual that an explanation must explain."""
+    least: NotNegative
+    """Smallest change of a number of the model that is a finding in a log: relative, or over its related length."""
     candidates: tuple[Candidate, ...]
+
+    def before_contact(self) -> Attribution:
+        """Return the limits for a difference before the first contact, which the contact cannot cause."""
+        kept = tuple(one for one in self.candidates if not one.name.startswith("contact."))
+        return self.model_copy(update={"candidates": kept})
 
 
 class Criteria(_Section):

@@ -19,8 +19,7 @@ from replays.recordings.validation.explanations.budget import Budget
 from replays.recordings.validation.explanations.signals import SignalFault
 from replays.recordings.validation.phases import QUANTITIES, Phase
 from replays.recordings.validation.statistics import StatisticResult
-from replays.recordings.validation.tolerance import Tolerated
-from replays.recordings.validation.trajectory import ChannelResidual
+from replays.recordings.validation.trajectory import ChannelResidual, Tolerated
 from replays.recordings.validation.truth import TruthResult
 from rig.base.outcome import Outcome
 from rig.base.text import build_html_table
@@ -83,11 +82,8 @@ class Validation:
         doubts: Inconsistencies within the recording; with any of them the validation fails.
         complete: Whether the recording was finished.
         contact_s: First contact of a log, if the trajectory ends before it [s]; otherwise None.
-<<<<<<< HEAD
-        budgets: Uncertainties of fitted numbers and quantities of a log, on request.
-=======
         tolerated: Parts of a log's residuals that what is uncertain explains.
->>>>>>> 9f44bce9 (wip2)
+        budgets: Uncertainties of fitted numbers and quantities of a log, on request.
         due_s: The same if the trajectory would have reached it with a valid model.
     """
 

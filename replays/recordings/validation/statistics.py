@@ -152,8 +152,8 @@ def make_quantity_reader(
 
 
 def _floor(parts: dict[str, Measured], names: tuple[str, ...]) -> float:
-    """Return the noise floor of the sum of those channels that are present."""
-    floors = [part.floor[c] for part in parts.values() for c, name in enumerate(part.names) if name in names]
+    """Return the standard deviation of the noise of the sum of those channels that are present."""
+    floors = [part.deviation[c] for part in parts.values() for c, name in enumerate(part.names) if name in names]
     return math.hypot(*floors)
 
 
@@ -181,7 +181,7 @@ def _ensemble(
         moved = None if predictions else perturbed(experiment, criteria.window.parameters, part)
         prediction = predictions[number] if moved is None else predict(moved, parts)
         loud = {
-            name: values + parts[name].floor * parts[name].random * generator.standard_normal(values.shape)
+            name: values + parts[name].random * parts[name].draw_noise(generator, len(values))
             for name, values in prediction.values.items()
         }
         members.append((loud, prediction))

@@ -1,4 +1,9 @@
-"""Residuals over their noise floors, sample by sample, within the predictable part of the trajectory."""
+"""Residuals over their noise floors, sample by sample, within the predictable part of the trajectory.
+
+A filter's corner, a calibration factor or a friction law that no log shows is one number for the whole log. It is
+fitted with its prior, so that it explains only a residual of its own shape: a contact that begins late, or another
+contact law, has another one. A floor as wide as the largest effect of each would hide both.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from replays.estimate.least_squares import solve_bounded
 from replays.estimate.runs import block_means
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.criteria import Criteria, TrajectoryCriterion
@@ -16,6 +22,10 @@ STRETCH = 128
 """Samples of a mean in the drift."""
 _NOISE_LIMIT = 7.0
 """Residual over its floor that noise never reaches."""
+_MAX_DEVIATION = 3.0
+"""Largest value of an uncertain number, in standard deviations."""
+_LEAST_SHOWN = 0.5
+"""Least value of an uncertain number that is stated, in standard deviations."""
 
 
 PULSES_ONLY = ", pulses only"
@@ -111,6 +121,96 @@ def scaled(part: Measured, values: np.ndarray, others: Sequence[np.ndarray] = ()
     return part.whiten(part.values[: len(values)] - values) / floors(part, values, others)
 
 
+@dataclass(frozen=True)
+class Uncertainty:
+    """Something that is known up to a standard deviation.
+
+    Attributes:
+        name: What it is, with its standard deviation.
+        prediction: Prediction with one standard deviation more of it.
+        each: Whether it is another number for each channel.
+    """
+
+    name: str
+    prediction: Prediction
+    each: bool = False
+
+
+@dataclass(frozen=True)
+class Tolerated:
+    """Part of a residual that an uncertainty explains.
+
+    Attributes:
+        name: What is uncertain, with its standard deviation.
+        channel: Channel; "" for all.
+        deviations: Its fitted value, in standard deviations.
+        largest: Largest effect on a sample, over the noise.
+    """
+
+    name: str
+    channel: str
+    deviations: float
+    largest: float
+
+    @property
+    def line(self) -> str:
+        """The result in words."""
+        where = f"{self.channel} " if self.channel else ""
+        return f"{where}{self.name}: {self.deviations:+.2g} of it, up to {self.largest:.2g} times the noise"
+
+
+def tolerate(
+    parts: dict[str, Measured], nominal: Prediction, uncertainties: Sequence[Uncertainty], *, end_s: float
+) -> tuple[dict[str, np.ndarray], list[Tolerated]]:
+    """Return residuals over the noise without what is uncertain, whitened, and what was tolerated.
+
+    Args:
+        parts: Recorded channels.
+        nominal: Prediction.
+        uncertainties: What is uncertain.
+        end_s: End of the samples [s].
+
+    Returns:
+        Residuals by group, each shape (n, channels), and what explains a part of them.
+    """
+    places = [(name, c) for name, part in parts.items() for c in range(len(part.channels))]
+    residuals, effects = {}, [dict[tuple[str, int], np.ndarray]() for _ in uncertainties]
+    for name, part in parts.items():
+        model = nominal.values[name][: part.count_rows(end_s)]
+        residuals[name] = part.whiten(part.values[: len(model)] - model) / part.floor
+        for effect, one in zip(effects, uncertainties, strict=True):
+            moved = np.nan_to_num(part.whiten(one.prediction.values[name][: len(model)] - model) / part.floor)
+            effect |= {(name, c): moved[:, c] for c, channel in enumerate(part.channels) if channel.name != "keyphasor"}
+    numbers = [
+        (one.name, own)
+        for one, effect in zip(uncertainties, effects, strict=True)
+        for own in ([{place: effect[place]} for place in effect] if one.each else [effect])
+        if any(signal.any() for signal in own.values())
+    ]
+    square, side = np.eye(len(numbers)), np.zeros(len(numbers))
+    for i, (_, own) in enumerate(numbers):
+        side[i] = sum(float(signal @ np.nan_to_num(residuals[name][:, c])) for (name, c), signal in own.items())
+        for k, (_, other) in enumerate(numbers[: i + 1]):
+            square[i, k] += sum(float(signal @ other[place]) for place, signal in own.items() if place in other)
+            square[k, i] = square[i, k]
+    fitted = solve_bounded(square, side, _MAX_DEVIATION)
+    tolerated = []
+    for (text, own), value in zip(numbers, fitted.tolist(), strict=True):
+        for (name, c), signal in own.items():
+            residuals[name][:, c] -= value * signal
+        channel = parts[next(iter(own))[0]].names[next(iter(own))[1]] if len(own) < len(places) - 1 else ""
+        largest = abs(value) * max(float(np.abs(signal).max()) for signal in own.values())
+        if abs(value) > _LEAST_SHOWN and largest > 1.0:
+            tolerated.append(Tolerated(text, channel, value, largest))
+    for name, part in parts.items():
+        if "keyphasor" in part.names:  # a pulse may shift by a row
+            c, rows = part.names.index("keyphasor"), len(residuals[name])
+            model = nominal.values[name][:rows]
+            floor = floors(part, model, [one.prediction.values[name][:rows] for one in uncertainties])
+            residuals[name][:, c] = (part.values[:rows, c] - model[:, c]) / floor[:, c]
+    return residuals, sorted(tolerated, key=lambda one: -one.largest)
+
+
 def residuals(
     parts: dict[str, Measured], scaled_residuals: Mapping[str, np.ndarray], criteria: Criteria
 ) -> list[ChannelResidual]:
@@ -151,6 +251,8 @@ def _judge(part: Measured, c: int, z: np.ndarray, criterion: TrajectoryCriterion
             starts = [float(part.times_s[over[0]])] if len(over) else []
             slow = np.flatnonzero(np.abs(means) > drift_limit)
             starts += [float(part.times_s[slow[0] * STRETCH])] if len(slow) else []
+            loud = block_means(z**2, STRETCH)
+            starts = starts or [float(part.times_s[int(np.argmax(loud)) * STRETCH])] if len(loud) else starts
             first = min(starts, default=float(part.times_s[0]))
     channel = part.channels[c]
     unit = "" if channel.unit == "1" else channel.unit

@@ -58,6 +58,8 @@ _MAX_MEDIAN_RESIDUAL = 10.0
 """Remaining residual of the median channel over its noise, above which most channels or the prediction are wrong."""
 _MIN_SHARE = 1e-3
 """Explained part relative to the largest one, below which a change is not reported with it."""
+_MAX_NAMED = 3
+"""Largest number of equally good causes that are named; more are none."""
 _MAX_TIED = 3
 """Largest number of equally good causes that are tried with a second one."""
 _OUTLIER_FLOORS = 7.0
@@ -209,6 +211,8 @@ def explain_log(
     numbers = explain_by_parameters(parts, nominal, others, tuned, rules, end_s=end_s) if sensors or far else []
     # A number that explains no more than the sensors do is not reported with them.
     numbers = [one for one in numbers if one.at_floor or one.explained > MIN_PART]
+    small = [one for one in numbers if abs(one.value) < rules.least * _find_size(tuned.baseline, one, rules)]
+    numbers = [one for one in numbers if one not in small]
     told_s = min((one.to_s for one in numbers), default=end_s)
     conclusion, best = conclude([*sensors, *numbers], sensors if cured else [], rules, end_s=told_s)
     if brought and cured:
@@ -238,11 +242,24 @@ def explain_log(
     elif not best and 0 < len(few := select_channels(sensors, tuned.scales)) < FEW_CHANNELS * len(tuned.scales):
         conclusion = f"of {len(tuned.scales)} channels {_join(few)} alone: an unknown fault, "
         conclusion += "or a number of the model that affects no other; this log does not distinguish them"
+    elif not best and small:
+        conclusion = f"a change of {_list(small[:_MAX_NAMED])} would explain it, which no calibration knows: "
+        conclusion += "another cause, or the model's equations"
     elif not best:
-        conclusion = "neither a sensor nor the clock explains it: the model differs; `rig identify` fits its numbers"
+        conclusion = "neither a sensor nor the clock explains it: the model differs"
+        if any(one.name.startswith("contact.") for one in rules.candidates):
+            conclusion += " from the first contact on (`rig identify --fit contact.friction,contact.restitution`)"
+        else:
+            conclusion += "; `rig identify` fits its numbers"
     return Explained(
         from_s, end_s, tuple(sorted([*sensors, *numbers], key=lambda one: -one.explained)), conclusion, best
     )
+
+
+def _find_size(experiment: Experiment, one: Explanation, rules: Attribution) -> float:
+    """Return the size to which the smallest change of a number of the model is relative, in the change's unit."""
+    key = next(each for each in rules.candidates if each.name == one.name).keys[0]
+    return get_scale(experiment, key) if one.unit else 1.0
 
 
 class _CandidateFit:
@@ -489,6 +506,10 @@ def conclude(
     names = tuple(one.name for one in equal)
     part = f"{single.explained:.2%} of the difference to {end_s:.3f} s, {single.left:.2f} of the noise left"
     short = "" if single.left < _NOISE else "no candidate alone explains it down to the noise; closest is "
+    if len(equal) > _MAX_NAMED:
+        some = _list(sorted(equal, key=lambda one: one.squares)[:_MAX_NAMED])
+        text = f"{len(equal)} causes explain it equally ({part}), such as {some}: this recording cannot tell which"
+        return text, ()
     if len(equal) == 1:
         return f"{short}{single.kind}: {single.name} {single.change} ({part})", names
     return f"{short}{_list(equal)} explain it equally ({part}); this recording does not distinguish them", names

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from replays.estimate.least_squares import solve
-from replays.estimate.whitening import NoiseSpectrum
+from replays.estimate.spectra import NoiseSpectrum
 from replays.recordings.resimulation.prediction import Measured
 
 _TURNS = 2
