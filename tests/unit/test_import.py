@@ -6,6 +6,8 @@ import json
 import math
 import os
 import re
+import subprocess
+import sys
 import tomllib
 import wave
 from datetime import timedelta
@@ -1080,3 +1082,41 @@ def test_a_subtracted_offset_is_a_remark(tmp_path: Path) -> None:
         assert f"P_N: an offset of 7.5 N was subtracted ({how}, bias)" in conversion.remarks
     conversion, _ = imported(tmp_path, [path], '[channels.P_N]\nsource = "P_N"\n')
     assert not any("offset" in remark for remark in conversion.remarks)
+
+
+_IMPORT = """
+import sys
+from pathlib import Path
+from replays.recordings.formats.conversion import convert, write_recording
+from replays.recordings.formats.mapping import load_mapping
+log = Path(sys.argv[1])
+write_recording(convert([log], load_mapping(log.with_suffix(".toml"))), log.with_suffix(".mcap"))
+print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak is read from /proc")
+@pytest.mark.parametrize("suffix", [".wav", ".tdms"])
+def test_memory_does_not_depend_on_the_length_of_a_log(tmp_path: Path, suffix: str) -> None:
+    rate_hz, names = 51_200, [f"channel {number + 1}" for number in range(8)]
+    channels = "".join(
+        f'[channels.c{number}]\nsource = "{name}"\nunit = "V"\nto = "c"\nto_unit = "V"\n{"bias = 1.0" * (number % 2)}\n'
+        for number, name in enumerate(names)
+    )
+    peaks_kb = []
+    for seconds in (5, 20):
+        log = tmp_path / f"{seconds}{suffix}"
+        log.with_suffix(".toml").write_text(channels)
+        second = np.random.default_rng(0).integers(-9000, 9000, (rate_hz, len(names)), dtype=np.int16)
+        if suffix == ".wav":
+            soundfile = pytest.importorskip("soundfile")
+            soundfile.write(log, np.tile(second, (seconds, 1)), rate_hz, subtype="PCM_16")
+        else:
+            nptdms = pytest.importorskip("nptdms")
+            rate = {"wf_increment": 1.0 / rate_hz}
+            with nptdms.TdmsWriter(log) as file:
+                for _ in range(seconds):
+                    columns = zip(names, second.T, strict=True)
+                    file.write_segment([nptdms.ChannelObject("g", name, each, rate) for name, each in columns])
+        peaks_kb.append(int(subprocess.check_output([sys.executable, "-c", _IMPORT, str(log)], text=True)))
+    assert peaks_kb[1] < 1.1 * peaks_kb[0], peaks_kb

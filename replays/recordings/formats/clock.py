@@ -80,9 +80,12 @@ class TimeAxis:
         """Time of the last sample [s]."""
         return self.first_s + (self.rows - 1) / self.rate_hz if self.times_s is None else float(self.times_s[-1])
 
-    def instants(self) -> np.ndarray:
-        """Return the time of each sample [s], shape (n,)."""
-        return self.first_s + np.arange(self.rows) / self.rate_hz if self.times_s is None else self.times_s
+    def instants(self, part: slice | None = None) -> np.ndarray:
+        """Return the time of each sample, or of some [s], shape (n,)."""
+        start, stop, _ = slice(None).indices(self.rows) if part is None else part.indices(self.rows)
+        return (
+            self.first_s + np.arange(start, stop) / self.rate_hz if self.times_s is None else self.times_s[start:stop]
+        )
 
     def shift(self, offset_s: float, stretch: float = 1.0) -> TimeAxis:
         """Return the axis on another clock, on which t becomes offset_s + stretch * t."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from heapq import merge
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from replays.estimate.runs import find_true_runs
+from replays.estimate.spool import release
 from replays.recordings.formats import clock
 from replays.recordings.formats.events import events
 from replays.recordings.formats.events.motion import ChannelMotion
@@ -353,19 +355,19 @@ def _catalogue(conversion: Conversion) -> dict[str, Any]:
 def _payloads(conversion: Conversion) -> Iterator[tuple[int, str, bytes]]:
     """Yield tick, key and bytes of each message, in order of time."""
     yield 0, wire.EVENTS, _event(0, "import", files=", ".join(file["name"] for file in conversion.document["files"]))
-    due: list[tuple[int, str, bytes | wire.Block]] = sorted(
-        [
-            *((tick, wire.EVENTS, payload) for tick, payload in _scene_events(conversion)),
-            *(block for name in conversion.counts for block in _blocks(conversion, name)),
-            *_edge_blocks(conversion),
-        ],
-        key=lambda item: item[0],
-    )
+    commands = sorted(_scene_events(conversion), key=lambda item: item[0])
+    streams: list[Iterable[tuple[int, str, bytes | wire.Block]]] = [
+        ((tick, wire.EVENTS, payload) for tick, payload in commands),
+        *(_blocks(conversion, name) for name in conversion.counts),
+        _edge_blocks(conversion),
+    ]
+    due = merge(*streams, key=lambda item: item[0])
     rows = wire.Continuity()
     for tick, key, content in due:
         if isinstance(content, wire.Block):
             rows.follow(key, content.index, len(content.values))
             content = wire.encode_block(content)
+            release(*conversion.counts.values(), *conversion.present.values())
         yield tick, key, content
     yield conversion.end_tick, wire.EVENTS, _event(conversion.end_tick, "end", reason="completed", rows=rows.next)
 

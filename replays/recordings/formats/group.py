@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import count, islice
 from typing import Any
 
 import numpy as np
 
+from replays.estimate.spool import ROWS, Spool, blocks, spool
 from replays.recordings.formats import clock
 from replays.recordings.formats.exporting.selection import NO_VOLTS
 from replays.recordings.formats.guessing import noise
@@ -193,17 +195,18 @@ def _place_signal(group: PlacedGroup, entry: MappedSignal, mapping: Mapping) -> 
             entry.raw = entry.signal.values[part]
         entry.noise = noise.estimate_noise(entry.values)
         return
-    if np.isnan(entry.values).any():
+    if any(np.isnan(entry.values[rows]).any() for rows in blocks(axis.rows, entry.values)):
         raise InputError(f"channels.{entry.name}.missing", '"hold" where samples are resampled', entry.mapping.missing)
     wanted = group.start_s + np.arange(group.rows) / rate
     # Interpolated samples have less noise, and it is not white.
     entry.noise = noise.estimate_noise(entry.values)
     if method == "linear":
-        entry.values, gain = clock.interpolate_linear(entry.values, axis, wanted), clock.linear_gain(axis, wanted)
+        values, gain = clock.interpolate_linear(entry.values, axis, wanted), clock.linear_gain(axis, wanted)
         how = "straight lines between samples"
     else:
-        entry.values = clock.resample_polyphase(entry.values, axis, group.start_s, rate, group.rows)
+        values = clock.resample_polyphase(entry.values, axis, group.start_s, rate, group.rows)
         how, gain = clock.FILTER, clock.polyphase_gain(axis, rate)
+    entry.values = spool([values])
     entry.noise *= gain
     entry.touched.append(f"{axis.rate_hz:.9g} Hz to {rate:.9g} Hz: {how}; noise {gain:.3f} times that of the samples")
 
@@ -226,10 +229,13 @@ def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str])
                              list(entry.angles_deg))  # fmt: skip
         probes = f"probes at {entry.angles_deg[0]:g} and {entry.angles_deg[1]:g} deg"
         inverse = np.linalg.inv(directions)
-        mixed = inverse @ np.stack([group[a].values, group[b].values])
+        pair, mixed = [group[a].values, group[b].values], (Spool(), Spool())
+        for rows in blocks(len(pair[0]), *pair):
+            for each, values in zip(mixed, inverse @ np.stack([values[rows] for values in pair]), strict=True):
+                each.add(values)
         noises = np.hypot(*(inverse * [group[a].noise, group[b].noise]).T)
         for name, values, level in zip((a, b), mixed, noises.tolist(), strict=True):
-            group[name].mix(values, noise=level)
+            group[name].mix(values.array(), noise=level)
             group[name].touched.append(f"x and y of {probes}")
         remarks.append(f"{a} and {b} computed from {probes}")
 
@@ -269,23 +275,46 @@ def quantise(
             channels.append(channel)
             columns.append(column)
             imported.append(_make_imported_channel(entry, channel, rule, group.rate_hz))
+        signals, raw = [e.values for e in group.channels.values()], [e.raw for e in group.channels.values()]
         default_group = default_table().groups.get(next(iter(group.channels.values())).target.group)
         title = default_group.title if default_group is not None else name
         tables[name] = Group(name=name, title=title, rate_hz=channels[0].rate_hz, channels=tuple(channels))
-        counts[name] = np.stack(columns, axis=1)
-        present[name] = np.all([np.isfinite(entry.values) for entry in group.channels.values()], axis=0)
+        everything = [*signals, *(each for each in raw if each is not None)]
+        size = ROWS // len(columns) + 1
+        counts[name] = spool(
+            np.stack([column(rows) for column in columns], axis=1)
+            for rows in blocks(group.rows, *everything, size=size)
+        )
+        present[name] = spool(
+            np.all([np.isfinite(values[rows]) for values in signals], axis=0)
+            for rows in blocks(group.rows, *signals, size=size)
+        )
     return ChannelTable(groups=tables, version=VERSION), counts, present, imported
 
 
-def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, np.ndarray, str]:
-    """Return a channel with its scale, its int32 counts, and the rule of its counts.
+def _extent(values: np.ndarray, offset: float = 0.0) -> tuple[float, float]:
+    """Return the lowest and the highest value above an offset, without nan; nan if there is none."""
+    with warnings.catch_warnings(action="ignore"):  # of blocks without values
+        ends = [
+            (np.nanmin(part), np.nanmax(part))
+            for rows in blocks(len(values), values)
+            if len(part := values[rows] - offset)
+        ]
+        return (float(np.nanmin(ends)), float(np.nanmax(ends))) if ends else (math.nan, math.nan)
+
+
+def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, Callable[[slice], np.ndarray], str]:
+    """Return a channel with its scale, the function that gives some rows of int32 counts, and the rule of its counts.
 
     Unmodified integers are kept. Other values are scaled by a power of two that puts the largest between a quarter and
     half of the int32 range, so that half a count is at most 2^-30 of it.
     """
     signal, values, raw, mixed = entry.signal, entry.values, entry.raw, entry.mixed
     limits = np.iinfo(np.int32)
-    keeps = raw is not None and len(raw) and int(raw.min()) >= limits.min and int(raw.max()) <= limits.max
+    keeps = False
+    if raw is not None and len(raw):
+        ends = [(int(raw[rows].min()), int(raw[rows].max())) for rows in blocks(len(raw), raw)]
+        keeps = min(ends)[0] >= limits.min and max(high for _, high in ends) <= limits.max
     volts_per_unit = None if entry.volts is None or mixed else entry.volts / entry.gain
     if keeps:
         scale = entry.gain * signal.scale
@@ -293,7 +322,7 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, n
     else:
         # Counts of a voltage are relative to 0 V, as those of a converter.
         offset = 0.0 if volts_per_unit is None else -entry.gain * entry.bias
-        largest = float(np.nanmax(np.abs(values - offset), initial=0.0))
+        largest = float(np.nanmax(np.abs(_extent(values, offset)), initial=0.0))
         if largest and not _MIN_VALUE <= largest <= _MAX_VALUE:
             raise InputError(f"channels.{entry.name}", f"of values from {_MIN_VALUE:g} to {_MAX_VALUE:g}", largest)
         scale = math.ldexp(1.0, math.frexp(largest)[1] - 30) if largest else math.ldexp(1.0, -30)
@@ -328,11 +357,17 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, n
     shapeless = channel.model_dump(exclude={*LowPass.model_fields} - {"bandwidth_hz"})
     channel = check(Channel, shapeless | entry.mapping.shape, field=f"channels.{entry.name}")
     if keeps and raw is not None:
-        return channel, raw.astype(np.int32), f"integers of the source, {abs(channel.scale):.6g} {channel.unit} each"
-    counts = np.rint((np.nan_to_num(values) - channel.offset) / channel.scale)
-    if len(counts) and not limits.min <= counts.min() <= counts.max() <= limits.max:
-        raise InputError(f"channels.{entry.name}", "within the range of its counts", float(np.nanmax(np.abs(values))))
-    return channel, counts.astype(np.int32), f"2^{round(math.log2(abs(scale)))} {channel.unit}"
+        rule = f"integers of the source, {abs(channel.scale):.6g} {channel.unit} each"
+        return channel, lambda rows: raw[rows].astype(np.int32), rule
+
+    def quantise_rows(rows: slice) -> np.ndarray:
+        counts = np.rint((np.nan_to_num(values[rows]) - channel.offset) / channel.scale)
+        if len(counts) and not limits.min <= counts.min() <= counts.max() <= limits.max:
+            largest = float(np.nanmax(np.abs(_extent(values))))
+            raise InputError(f"channels.{entry.name}", "within the range of its counts", largest)
+        return counts.astype(np.int32)
+
+    return channel, quantise_rows, f"2^{round(math.log2(abs(scale)))} {channel.unit}"
 
 
 def _make_imported_channel(entry: MappedSignal, channel: Channel, rule: str, rate_hz: float) -> ImportedChannel:
@@ -342,6 +377,7 @@ def _make_imported_channel(entry: MappedSignal, channel: Channel, rule: str, rat
     gain = f"{entry.gain:.9g}{ratio} * " if ratio or entry.gain != 1.0 else ""
     delay = f", {-entry.mapping.delay_us:+g} µs" if entry.mapping.delay_us else ""
     drift = (entry.axis.rate_hz / channel.rate_hz - 1.0) * 1e6
+    low, high = _extent(entry.values)
     drift = drift if abs(drift) < _MAX_CLOCK_ERROR * 1e6 and not entry.touched else 0.0
     return ImportedChannel(
         name=entry.name, unit=channel.unit,
@@ -349,5 +385,5 @@ def _make_imported_channel(entry: MappedSignal, channel: Channel, rule: str, rat
         formula=f"{gain}{source}",
         time=f"{entry.axis.note}{delay}; " + ("; ".join(entry.touched) or "samples as they were"),
         counts=rule, rate_hz=rate_hz, jitter_us=entry.axis.jitter_s[1] * 1e6, drift_ppm=drift, missing=entry.missing,
-        overrange=entry.overrange, low=float(np.nanmin(entry.values)), high=float(np.nanmax(entry.values)),
+        overrange=entry.overrange, low=low, high=high,
     )  # fmt: skip

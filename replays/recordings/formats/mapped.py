@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
+from replays.estimate.spool import blocks, nan_mean, spool
 from replays.recordings.formats import clock
 from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalName
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
@@ -118,8 +119,9 @@ class Log:
         if not len(signal.values):
             raise InputError(where, "a signal with values", Words(f"{entry.name}, which is empty"))
         axis = self._axis(signal, f"{entry.name} in {source.path.name}")
+        signal = replace(signal, times_s=None)
         if axis.numbers is not None:
-            signal = replace(signal, values=axis.place_samples(signal.values.astype(float)))
+            signal = replace(signal, values=spool([axis.place_samples(signal.values.astype(float))]))
         return signal, axis
 
     def _axis(self, signal: FileSignal, what: str) -> clock.TimeAxis:
@@ -265,41 +267,55 @@ def check_rows(signals: Sequence[MappedSignal]) -> None:
             raise InputError(f"channels.{entry.name}", "a signal of two or more values", entry.axis.rows)
 
 
-def _is_inside(axis: clock.TimeAxis, mapping: Mapping) -> np.ndarray:
-    times_s = axis.instants()
+def _is_inside(times_s: np.ndarray, mapping: Mapping) -> np.ndarray:
     low, high = mapping.time.from_s, mapping.time.to_s
     return (times_s >= (-math.inf if low is None else low)) & (times_s <= (math.inf if high is None else high))
 
 
 def convert_to_engineering(entry: MappedSignal, mapping: Mapping) -> None:
     """Convert values to the channel's unit; count missing and overrange values and treat missing ones."""
-    wanted, where = entry.mapping, f"channels.{entry.name}"
-    physical = entry.signal.physical
-    bad = ~np.isfinite(physical)
-    entry.missing = int(bad.sum())
-    if wanted.full_scale is not None:
-        entry.overrange = int((np.abs(physical) >= wanted.full_scale).sum())
-    elif entry.signal.rails is not None:
-        low, high = entry.signal.rails
-        entry.overrange = int(((entry.signal.values <= low) | (entry.signal.values >= high)).sum())
-    if bad.all():
+    wanted, where, signal, rows = entry.mapping, f"channels.{entry.name}", entry.signal, len(entry.signal.values)
+    first_bad: int | None = None
+    first_good: float | None = None
+    for part in blocks(rows, signal.values):
+        physical = signal.convert(part)
+        good = np.isfinite(physical)
+        entry.missing += int((~good).sum())
+        if first_bad is None and not good.all():
+            first_bad = part.start + int(np.argmin(good))
+        if first_good is None and good.any():
+            first_good = float(physical[np.argmax(good)])
+        if wanted.full_scale is not None:
+            entry.overrange += int((np.abs(physical) >= wanted.full_scale).sum())
+        elif signal.rails is not None:
+            low, high = signal.rails
+            entry.overrange += int(((signal.values[part] <= low) | (signal.values[part] >= high)).sum())
+    if first_good is None:
         raise InputError(where, "a signal with finite values", entry.entry.name)
-    if entry.missing:
-        at = int(np.argmax(bad))
+    if first_bad is not None:
         if wanted.missing == "refuse":
-            time_s = float(entry.axis.instants()[at])
-            raise InputError(where, 'free of missing values (missing = "gap" or "hold")',
-                             Words(f"{entry.missing} of them, the first in row {at + 1} at {time_s:g} s"))  # fmt: skip
+            time_s = float(entry.axis.instants()[first_bad])
+            must = 'free of missing values (missing = "gap" or "hold")'
+            text = f"{entry.missing} of them, the first in row {first_bad + 1} at {time_s:g} s"
+            raise InputError(where, must, Words(text))
         if wanted.missing == "hold":
-            last = np.maximum.accumulate(np.where(bad, -1, np.arange(len(bad))))
-            last[last < 0] = int(np.argmax(~bad))
-            physical = physical[last]
             entry.touched.append(f"{entry.missing} missing values held")
-        else:
-            physical = np.where(bad, np.nan, physical)
+
+    def fill() -> Iterator[tuple[slice, np.ndarray]]:
+        """Yield physical values in which missing ones are nan, or the value before."""
+        last = first_good
+        for part in blocks(rows, signal.values):
+            physical = signal.convert(part)
+            good = np.isfinite(physical)
+            if wanted.missing == "hold":
+                before = np.maximum.accumulate(np.where(good, np.arange(len(good)), -1))
+                physical = np.where(before < 0, last, physical[before])
+                last = physical[-1]
+            yield part, np.where(np.isfinite(physical), physical, np.nan)
+
     if wanted.bias == "mean":
-        inside = physical[_is_inside(entry.axis, mapping)]
-        entry.bias = float(np.nanmean(inside)) if len(inside) else 0.0
+        inside = spool(values[_is_inside(entry.axis.instants(part), mapping)] for part, values in fill())
+        entry.bias = nan_mean(inside) if len(inside) else 0.0
     else:
         entry.bias = float(wanted.bias)
-    entry.values = entry.gain * (physical - entry.bias)
+    entry.values = spool(entry.gain * (values - entry.bias) for _, values in fill())

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from replays.estimate.clock import find_rate
+from replays.estimate.spool import Spool, blocks, spool
 from rig.base.checks import DOCUMENT_BYTES, describe_error, load_extensions, read_json
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.files import build_read_error, open_file, read_file
@@ -157,7 +158,11 @@ class FileSignal:
     @property
     def physical(self) -> np.ndarray:
         """Values in the file's unit, nan for those that no measurement has, float64, shape (n,)."""
-        values = self.values.astype(float)
+        return self.convert(slice(None))
+
+    def convert(self, rows: slice) -> np.ndarray:
+        """Return some rows of `physical`."""
+        values = self.values[rows].astype(float)
         if self.values.dtype.kind == "f":
             values[~(np.abs(values) <= _MAX_VALUE)] = np.nan
         if (self.scale, self.offset) != (1.0, 0.0):
@@ -234,7 +239,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
             signal = source.read(entry)
             _check(signal)
             _check_count(len(signal.values), entry)
-        return signal
+        return signal if isinstance(signal.values, np.memmap) else replace(signal, values=spool([signal.values]))
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         assert source.pieces is not None
@@ -290,6 +295,19 @@ def _translate_errors(path: Path, what: str) -> Iterator[None]:
         raise read_error(path, what, error) from None
 
 
+def join_pieces(pieces: Iterator[list[FileSignal]]) -> FileSignal:
+    """Return the pieces of one signal as a whole, in temporary files if they are long."""
+    values, times_s = Spool(), Spool()
+    signal: FileSignal | None = None
+    for (signal,) in pieces:
+        values.add(signal.values)
+        if signal.times_s is not None:
+            times_s.add(signal.times_s)
+    if signal is None:
+        raise ValueError("no values")
+    return replace(signal, values=values.array(), times_s=None if signal.times_s is None else times_s.array())
+
+
 def _check(signal: FileSignal) -> None:
     """Check that the numbers of a signal are plausible for a measurement.
 
@@ -305,7 +323,10 @@ def _check(signal: FileSignal) -> None:
         raise ValueError(f"a scale of {signal.scale}, an offset of {signal.offset}")
     if not abs(signal.first_s) <= _MAX_TIME_S:
         raise ValueError(f"a start time of {signal.first_s} s")
-    if times_s is not None and not (times_s.shape == values.shape and bool((np.abs(times_s) <= _MAX_TIME_S).all())):
+    if times_s is not None and not (
+        times_s.shape == values.shape
+        and all((np.abs(times_s[rows]) <= _MAX_TIME_S).all() for rows in blocks(len(times_s), times_s))
+    ):
         raise ValueError(f"time stamps that are not finite numbers up to {_MAX_TIME_S:g} s, one per row")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from replays.estimate.spectra import periodic_hann, power
+from replays.estimate.spool import Spool, blocks, spool
 
 _SEGMENT = 256
 """Samples per segment of the spectrum."""
@@ -13,6 +14,8 @@ _FIRST_LINE = 16
 _QUIET_PART, _SHAPE_PART = 0.1, 0.4
 """Quantile of the segments that counts as quiet, line by line, so that temporary motion is excluded. The second one is
 for the spectral shape, which needs more segments."""
+_LINES, _LINES_ROWS = 4, 1 << 11
+"""Spectral lines, and segments, that are read at a time."""
 _MEDIAN_LINES = 9
 """Lines of a running median, which suppresses single tones."""
 _MAX_LINE_RATIO = 3.0
@@ -35,14 +38,21 @@ def segment_spectra(values: np.ndarray) -> np.ndarray:
     It is computed from second differences, corrected for their gain, which removes slow motion. White noise has its
     variance in each line.
     """
-    second = np.diff(values, 2)
-    second = second[np.isfinite(second)]
-    stretches = second[: len(second) // _SEGMENT * _SEGMENT].reshape(-1, _SEGMENT)
-    still = ~stretches.any(axis=1)
-    if not still.all() and (stretches[~still] == 0.0).mean() < _MAX_ZERO_FRACTION:
-        stretches = stretches[~still]  # stuck: no noise
-    lines = power(stretches, periodic_hann(_SEGMENT))[:, _FIRST_LINE:-1]
-    return lines / (2.0 * np.sin(np.pi * np.arange(_FIRST_LINE, _SEGMENT // 2) / _SEGMENT)) ** 4
+    gain = (2.0 * np.sin(np.pi * np.arange(_FIRST_LINE, _SEGMENT // 2) / _SEGMENT)) ** 4
+    window, rest, zeros = periodic_hann(_SEGMENT), np.empty(0), 0
+    spectra, moves = Spool(), list[np.ndarray]()
+    for rows in blocks(len(values) - 2, values):
+        second = np.diff(values[rows.start : rows.stop + 2], 2)
+        second = np.concatenate([rest, second[np.isfinite(second)]])
+        stretches, rest = np.split(second, [len(second) // _SEGMENT * _SEGMENT])
+        stretches = stretches.reshape(-1, _SEGMENT)
+        spectra.add(power(stretches, window)[:, _FIRST_LINE:-1] / gain)
+        moves.append(np.any(stretches != 0.0, axis=1))
+        zeros += np.count_nonzero(stretches[moves[-1]] == 0.0)
+    moving, lines = np.concatenate(moves), spectra.array()
+    if zeros < _MAX_ZERO_FRACTION * _SEGMENT * np.count_nonzero(moving) and not moving.all():
+        lines = spool(lines[rows][moving[rows]] for rows in blocks(len(lines), lines))  # stuck: no noise
+    return lines
 
 
 def _floor(values: np.ndarray, quiet: float) -> tuple[np.ndarray, int]:
@@ -53,7 +63,14 @@ def _floor(values: np.ndarray, quiet: float) -> tuple[np.ndarray, int]:
         return np.empty(0), 0
     # Powers of noise are exponentially distributed: the k-th smallest of n has the mean 1/n + ... + 1/(n - k + 1).
     means = np.cumsum(1.0 / np.arange(rows, 0, -1))
-    return np.quantile(spectra, quiet, axis=0) / np.interp(quiet * (rows - 1), np.arange(rows), means), rows
+    lines = [  # a few lines at a time
+        np.quantile(
+            np.concatenate([spectra[part, first : first + _LINES] for part in blocks(rows, spectra, size=_LINES_ROWS)]),
+            quiet, axis=0,
+        )
+        for first in range(0, spectra.shape[1], _LINES)
+    ]  # fmt: skip
+    return np.concatenate(lines) / np.interp(quiet * (rows - 1), np.arange(rows), means), rows
 
 
 def estimate_noise(values: np.ndarray) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from replays.recordings.formats.exporting import export
 from replays.recordings.formats.readers.dialect import parse_heading, time_column
-from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, join_pieces
 from rig.base.files import find_data_limit
 
 _PIECE = 1 << 16
@@ -67,15 +66,8 @@ def look_into(path: Path, options: FileOptions) -> Source:
                 Entry(name, "", unit or notes.get("unit", ""), file.metadata.num_rows, rate, c, notes.get("label", ""))
             )
 
-    @cache
-    def times_s() -> np.ndarray | None:
-        return None if stamps is None else whole(stamps) * scale
-
-    def whole(c: int) -> np.ndarray:
-        return numbers(file.read(columns=[schema.field(c).name]).column(0), base)
-
     def read(entry: Entry) -> FileSignal:
-        return FileSignal(values=whole(entry.place), times_s=times_s())
+        return join_pieces(pieces([entry]))
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         wanted = [entry.place for entry in entries]

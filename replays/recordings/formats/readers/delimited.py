@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.estimate.spool import Spool, blocks, spool
 from replays.recordings.formats.readers import columnar
 from replays.recordings.formats.readers.dialect import (
     MISSING,
@@ -112,12 +113,16 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
     @cache
     def columns() -> list[np.ndarray]:
-        parts = zip(*(_parse_columns(path, layout, options, stamps, date) if kept is None else kept), strict=True)
-        return [np.concatenate([columnar.numbers(each, base) for each in column]) for column in parts]
+        spools = [Spool() for _ in names]
+        for part in _parse_columns(path, layout, options, stamps, date) if kept is None else kept:
+            for each, column in zip(spools, part, strict=True):
+                each.add(columnar.numbers(column, base))
+        return [each.array() for each in spools]
 
     @cache
     def times_s() -> np.ndarray | None:
-        return None if stamps is None else columns()[stamps] * scale
+        stored = columns()[stamps] if stamps is not None else None
+        return None if stored is None else spool(stored[part] * scale for part in blocks(rows, stored))
 
     def read(entry: Entry) -> FileSignal:
         if layout.stamps is not None:

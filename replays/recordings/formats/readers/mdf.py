@@ -22,6 +22,7 @@ from replays.recordings.formats.source import (
     FileSignal,
     Source,
     even_rate_hz,
+    join_pieces,
     load_library,
     read_error,
 )
@@ -73,6 +74,8 @@ def look_into(path: Path, options: FileOptions) -> Source:
         entries, texts = _entries(mdf, options)
 
     def read(entry: Entry) -> FileSignal:
+        if _has_own_stamps(mdf, entry.group_number):
+            return join_pieces(pieces([entry]))
         with _suppress_output():
             group, index = entry.place
             return _signal(mdf, group, index, options)

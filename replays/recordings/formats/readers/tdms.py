@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.estimate.spool import blocks, spool
 from replays.recordings.formats.exporting import export
 from replays.recordings.formats.readers.dialect import is_time, parse_heading
 from replays.recordings.formats.source import Entry, FileSignal, Source, load_library, read_error
@@ -24,6 +25,8 @@ _SENSOR_PROPERTIES = re.compile("sens|bias|gain|coupling|range", re.IGNORECASE)
 """Properties of a channel that describe its sensor or amplifier."""
 _MAX_SCALES, _MAX_SUMS = 64, 8
 """Most scales of a channel, and most that add two others: npTDMS computes each of these for each use."""
+_PIECE = 1 << 20
+"""Rows that are read at a time."""
 _RAW_INPUT = 0xFFFFFFFF
 """Input of the first scale: the raw values."""
 
@@ -121,13 +124,14 @@ def _signal(group: Any, name: str, start: Any, options: FileOptions, times_name:
         and properties.get("NI_Scale[0]_Scale_Type") == "Linear"
         and properties.get("NI_Scaling_Status", "unscaled") == "unscaled"
     )
+    rows = blocks(len(channel), size=_PIECE)
     if linear and np.dtype(channel.data_type.nptype).kind in "iu":
-        values = np.array(channel.read_data(scaled=False))
+        values = spool(channel.read_data(each.start, each.stop - each.start, scaled=False) for each in rows)
         scale = float(properties["NI_Scale[0]_Linear_Slope"])
         offset = float(properties["NI_Scale[0]_Linear_Y_Intercept"])
     else:
-        values = np.array(channel[:])
-        values = values if values.dtype.kind in "iu" else values.astype(float)
+        parts = (channel.read_data(each.start, each.stop - each.start) for each in rows)
+        values = spool(part if part.dtype.kind in "iu" else part.astype(float) for part in parts)
     step = properties.get("wf_increment")
     if step:
         began = properties.get("wf_start_time", start)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat
 
+from replays.estimate.spool import ROWS, spool
 from replays.recordings.formats.exporting import export
 from replays.recordings.formats.source import Entry, FileSignal, Source, load_library
 from rig.base.checks import DOCUMENT_BYTES, check
@@ -48,17 +49,13 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
     def read(entry: Entry) -> FileSignal:
         with soundfile.SoundFile(path) as file:
-            parts = [
-                block[:, entry.place].copy()
-                for block in file.blocks(1 << 16, dtype="float64" if bits is None else "int32", always_2d=True)
-            ]
-        values = np.concatenate(parts) if parts else np.empty(0)
+            kind, shift = ("float64", 0) if bits is None else ("int32", 32 - bits)
+            parts = (block[:, entry.place] for block in file.blocks(ROWS, dtype=kind, always_2d=True))
+            values = spool(part >> shift if shift else part.copy() for part in parts)
         column = columns[entry.place]
         full, offset = column.full_scale, column.offset_exported
         rails = None
         if bits is not None:
-            shift = 32 - bits
-            values = values.astype(np.int32) >> shift
             full /= 2.0 ** (bits - 1)
             rails = (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1.0)
         return FileSignal(values=values, scale=full, offset=offset, rate_hz=float(rate), first_s=first_s, rails=rails)
