@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import tempfile
+import warnings
 from collections.abc import Iterable, Iterator
 from typing import IO
 
@@ -85,6 +87,17 @@ def blocks(rows: int, *arrays: np.ndarray, size: int = ROWS) -> Iterator[slice]:
     for start in range(0, max(rows, 1), size):
         yield slice(start, min(start + size, rows))
         release(*arrays)
+
+
+def find_extent(values: np.ndarray, offset: float = 0.0) -> tuple[float, float]:
+    """Return the lowest and the highest value above an offset, without nan; nan if there is none."""
+    with warnings.catch_warnings(action="ignore"):  # of blocks without values
+        ends = [
+            (np.nanmin(part), np.nanmax(part))
+            for rows in blocks(len(values), values)
+            if len(part := values[rows] - offset)
+        ]
+        return (float(np.nanmin(ends)), float(np.nanmax(ends))) if ends else (math.nan, math.nan)
 
 
 def nan_mean(values: np.ndarray) -> float:

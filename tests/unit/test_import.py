@@ -1106,8 +1106,9 @@ def test_memory_does_not_depend_on_the_length_of_a_log(tmp_path: Path, suffix: s
     peaks_kb = []
     for seconds in (5, 20):
         log = tmp_path / f"{seconds}{suffix}"
-        log.with_suffix(".toml").write_text(channels)
+        log.with_suffix(".toml").write_text(f'{channels}[keyphasor]\nsource = "channel 1"\n')
         second = np.random.default_rng(0).integers(-9000, 9000, (rate_hz, len(names)), dtype=np.int16)
+        second[:, 0] = np.where(np.arange(rate_hz) % 2560 < 256, 9000, -9000)
         if suffix == ".wav":
             soundfile = pytest.importorskip("soundfile")
             soundfile.write(log, np.tile(second, (seconds, 1)), rate_hz, subtype="PCM_16")

@@ -10,6 +10,7 @@ import numpy as np
 
 from replays.estimate.clock import Line, find_rate, find_resolution, fit_line
 from replays.estimate.spectra import parabola_top
+from replays.estimate.spool import blocks, find_extent
 from rig.base.errors import InputError, Words
 
 EVENNESS_TOLERANCE = 0.05
@@ -309,39 +310,48 @@ def find_crossings(
     Returns:
         Instants [s], shape (k,), and the level. Without a threshold, a signal of noise alone has none.
     """
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    low, high = find_extent(values)
     level = 0.5 * (low + high) if threshold is None else threshold
     back = 0.1 * (high - low) if hysteresis is None else hysteresis
     if threshold is None and high > low and _is_noise(values, level, high - low):
         return np.empty(0), level
     sign = -1.0 if falling else 1.0
-    signal = sign * (np.nan_to_num(values, nan=low) - level)
-    upward = np.flatnonzero((signal[:-1] < 0.0) & (signal[1:] >= 0.0))
-    if not len(upward):
-        return np.empty(0), level
     # A crossing counts if the signal has been below the hysteresis band since the previous one. The first row may be on
     # a rising flank, from which the band is left upwards, or on a falling one, where noise crosses the level.
-    outside = np.flatnonzero(np.abs(signal) > back)[:1]
-    rising = int(outside[0]) if len(outside) and signal[outside[0]] > 0.0 else 0
-    below = np.concatenate([[0], np.cumsum(signal < -back)])
-    kept, last = [], -1
-    for at in upward.tolist():
-        if below[at + 1] > below[last + 1] or (last < 0 and at < rising):
-            kept.append(at)
-            last = at
-    at = np.array(kept, dtype=int)
-    times_s = axis.instants()
-    part = -signal[at] / (signal[at + 1] - signal[at])
-    return times_s[at] + part * (times_s[at + 1] - times_s[at]), level
+    rising, last, below, until, kept = 0, -1, 0, 0, [np.empty(0)]
+
+    def load(rows: slice) -> np.ndarray:
+        return sign * (np.nan_to_num(values[rows.start : rows.stop + 1], nan=low) - level)
+
+    for rows in blocks(len(values) - 1, values):
+        if len(outside := np.flatnonzero(np.abs(signal := load(rows)) > back)):
+            rising = rows.start + int(outside[0]) if signal[outside[0]] > 0.0 else 0
+            break
+    for rows in blocks(len(values) - 1, values):
+        signal = load(rows)
+        counts = below + np.cumsum(signal[:-1] < -back)
+        found = []
+        for at in np.flatnonzero((signal[:-1] < 0.0) & (signal[1:] >= 0.0)).tolist():
+            if counts[at] > until or (last < 0 and rows.start + at < rising):
+                found.append(at)
+                last, until = rows.start + at, int(counts[at])
+        below = int(counts[-1]) if len(counts) else below
+        at, times_s = np.array(found, dtype=int), axis.instants(slice(rows.start, rows.stop + 1))
+        part = -signal[at] / (signal[at + 1] - signal[at])
+        kept.append(times_s[at] + part * (times_s[at + 1] - times_s[at]))
+    return np.concatenate(kept), level
 
 
 def _is_noise(values: np.ndarray, level: float, spread: float) -> bool:
     """Return whether a signal has no pulse: it is spread about the middle of its range, as noise is."""
-    held = values[np.isfinite(values)]
-    low, high = np.quantile(held, (0.25, 0.75))
-    return float(np.mean(np.abs(held - level) < _NOISE_BAND * spread)) > _MAX_BAND_PART and bool(
-        spread < _NOISE_RANGE * (high - low)
-    )
+    near = total = 0
+    for rows in blocks(len(values), values):
+        held = values[rows][np.isfinite(values[rows])]
+        near, total = near + int((np.abs(held - level) < _NOISE_BAND * spread).sum()), total + len(held)
+    if not near > _MAX_BAND_PART * total:
+        return False
+    low, high = np.quantile(values[np.isfinite(values)], (0.25, 0.75))
+    return bool(spread < _NOISE_RANGE * (high - low))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from replays.estimate.runs import find_true_runs
-from replays.estimate.spool import release
+from replays.estimate.spool import find_extent, release
 from replays.recordings.formats import clock
 from replays.recordings.formats.events import events
 from replays.recordings.formats.events.motion import ChannelMotion
@@ -257,7 +257,7 @@ def _range(signals: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse
         all_pulses, passed_over = find_pulses(hammer.values, hammer.axis, mapping.hammer)
         pulses = tuple(pulse for pulse in all_pulses if low <= pulse.at_s <= high)
         if not pulses:
-            largest = float(np.nanmax(hammer.values))
+            largest = find_extent(hammer.values)[1]
             raise InputError("hammer.threshold_n", f"below the largest force, {largest:.3g} N, in what is imported",
                              mapping.hammer.threshold_n)  # fmt: skip
         first_pulses = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in pulses[:5])
@@ -292,7 +292,7 @@ def _edges(log: Log, zero_s: float, groups: dict[str, PlacedGroup]) -> np.ndarra
     if not len(edges_s) and wanted.threshold is None:
         log.remarks.append(f"no keyphasor pulse: {entry.name} stays within its noise")
     elif not len(edges_s):
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        low, high = find_extent(values)
         raise InputError("keyphasor.threshold", f"between {low:.4g} and {high:.4g}, the ends of {entry.name}", level)
     edges_s = edges_s[:: wanted.pulses_per_turn]
     end_s = max(group.start_s + group.rows / group.rate_hz for group in groups.values())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import count, islice
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.estimate.spool import ROWS, Spool, blocks, spool
+from replays.estimate.spool import ROWS, Spool, blocks, find_extent, spool
 from replays.recordings.formats import clock
 from replays.recordings.formats.exporting.selection import NO_VOLTS
 from replays.recordings.formats.guessing import noise
@@ -292,17 +291,6 @@ def quantise(
     return ChannelTable(groups=tables, version=VERSION), counts, present, imported
 
 
-def _extent(values: np.ndarray, offset: float = 0.0) -> tuple[float, float]:
-    """Return the lowest and the highest value above an offset, without nan; nan if there is none."""
-    with warnings.catch_warnings(action="ignore"):  # of blocks without values
-        ends = [
-            (np.nanmin(part), np.nanmax(part))
-            for rows in blocks(len(values), values)
-            if len(part := values[rows] - offset)
-        ]
-        return (float(np.nanmin(ends)), float(np.nanmax(ends))) if ends else (math.nan, math.nan)
-
-
 def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, Callable[[slice], np.ndarray], str]:
     """Return a channel with its scale, the function that gives some rows of int32 counts, and the rule of its counts.
 
@@ -322,7 +310,7 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, C
     else:
         # Counts of a voltage are relative to 0 V, as those of a converter.
         offset = 0.0 if volts_per_unit is None else -entry.gain * entry.bias
-        largest = float(np.nanmax(np.abs(_extent(values, offset)), initial=0.0))
+        largest = float(np.nanmax(np.abs(find_extent(values, offset)), initial=0.0))
         if largest and not _MIN_VALUE <= largest <= _MAX_VALUE:
             raise InputError(f"channels.{entry.name}", f"of values from {_MIN_VALUE:g} to {_MAX_VALUE:g}", largest)
         scale = math.ldexp(1.0, math.frexp(largest)[1] - 30) if largest else math.ldexp(1.0, -30)
@@ -363,7 +351,7 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, C
     def quantise_rows(rows: slice) -> np.ndarray:
         counts = np.rint((np.nan_to_num(values[rows]) - channel.offset) / channel.scale)
         if len(counts) and not limits.min <= counts.min() <= counts.max() <= limits.max:
-            largest = float(np.nanmax(np.abs(_extent(values))))
+            largest = float(np.nanmax(np.abs(find_extent(values))))
             raise InputError(f"channels.{entry.name}", "within the range of its counts", largest)
         return counts.astype(np.int32)
 
@@ -377,7 +365,7 @@ def _make_imported_channel(entry: MappedSignal, channel: Channel, rule: str, rat
     gain = f"{entry.gain:.9g}{ratio} * " if ratio or entry.gain != 1.0 else ""
     delay = f", {-entry.mapping.delay_us:+g} µs" if entry.mapping.delay_us else ""
     drift = (entry.axis.rate_hz / channel.rate_hz - 1.0) * 1e6
-    low, high = _extent(entry.values)
+    low, high = find_extent(entry.values)
     drift = drift if abs(drift) < _MAX_CLOCK_ERROR * 1e6 and not entry.touched else 0.0
     return ImportedChannel(
         name=entry.name, unit=channel.unit,

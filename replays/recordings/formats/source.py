@@ -158,7 +158,7 @@ class FileSignal:
     @property
     def physical(self) -> np.ndarray:
         """Values in the file's unit, nan for those that no measurement has, float64, shape (n,)."""
-        return self.convert(slice(None))
+        return spool(self.convert(rows) for rows in blocks(len(self.values), self.values))
 
     def convert(self, rows: slice) -> np.ndarray:
         """Return some rows of `physical`."""

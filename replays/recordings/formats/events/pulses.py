@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.estimate.runs import find_true_runs
+from replays.estimate.runs import split_at_breaks
+from replays.estimate.spool import blocks, spool
 
 if TYPE_CHECKING:
     from replays.recordings.formats.clock import TimeAxis
@@ -60,21 +61,25 @@ def find_pulses(
         axis: Its time axis.
         wanted: Threshold, dead time and direction.
     """
-    times_s = axis.instants()
-    force = np.nan_to_num(force_n)
-    above_s = times_s[np.abs(force) >= wanted.threshold_n]  # both signs, as the hammer rings
+    force = spool(np.nan_to_num(force_n[part]) for part in blocks(len(force_n), force_n))
+    above_s, above = list[np.ndarray](), list[np.ndarray]()
+    for part in blocks(len(force), force):
+        above_s.append(axis.instants(part)[np.abs(force[part]) >= wanted.threshold_n])  # both signs: the hammer rings
+        above.append(part.start + np.flatnonzero(force[part] >= wanted.threshold_n))
     pulses: list[HammerPulse] = []
     ignored: list[HammerPulse] = []
     next_allowed_s = -math.inf
-    for start, end in find_true_runs(force >= wanted.threshold_n):
-        at_s = float(times_s[start])
+    loud_s, loud = np.concatenate(above_s), np.concatenate(above)
+    for start, end in split_at_breaks(np.diff(loud) > 1) if len(loud) else []:
+        run = int(loud[start]), int(loud[end - 1]) + 1
+        at_s = float(axis.instants(slice(*run))[0])
         last = pulses[-1] if pulses else None
         soon = last is not None and at_s < next_allowed_s
         if last is not None and soon:
-            before = int(np.searchsorted(above_s, at_s))
-            if at_s - above_s[before - 1] < _MIN_PAUSE_LENGTHS * 1e-3 * last.duration_ms:
+            before = int(np.searchsorted(loud_s, at_s))
+            if at_s - loud_s[before - 1] < _MIN_PAUSE_LENGTHS * 1e-3 * last.duration_ms:
                 continue
-        pulse = _pulse(force, times_s, (start, end), axis.rate_hz, wanted)
+        pulse = _pulse(force, axis, run, wanted)
         if last is not None and soon and (wanted.dead_s is not None or pulse.force_n < _MIN_PEAK_RATIO * last.force_n):
             ignored.append(pulse)
             continue
@@ -83,9 +88,7 @@ def find_pulses(
     return pulses, ignored
 
 
-def _pulse(
-    force: np.ndarray, times_s: np.ndarray, above: tuple[int, int], rate_hz: float, wanted: HammerMapping
-) -> HammerPulse:
+def _pulse(force: np.ndarray, axis: TimeAxis, above: tuple[int, int], wanted: HammerMapping) -> HammerPulse:
     """Return the pulse that exceeds the threshold in a range of rows."""
     low, high = above
     foot = _FOOT_FRACTION * float(force[low:high].max())
@@ -93,8 +96,8 @@ def _pulse(
         low -= 1
     while high < len(force) and force[high] > foot:
         high += 1
-    pulse, when = force[low:high], times_s[low:high]
-    peak, impulse = float(pulse.max()), float(pulse.sum()) / rate_hz
+    pulse, when = force[low:high], axis.instants(slice(low, high))
+    peak, impulse = float(pulse.max()), float(pulse.sum()) / axis.rate_hz
     duration = 0.5 * math.pi * impulse / peak
     centre = float(pulse @ when) / float(pulse.sum())
     return HammerPulse(centre - 0.5 * duration - wanted.delay_us * 1e-6, peak, duration * 1e3, wanted.direction)
