@@ -168,9 +168,6 @@ def tune_few_channels(folder: Path, motion: second_rig.Motion, *, seed: int = 3,
     return tune(log, Experiment.from_recording(log))
 
 
-MOTION_KEYS = (ANGLE, "state.ring_x", "state.ring_y", "state.vx", "state.vy", "drive.speed_hz", "ring.offset_y")
-
-
 def test_a_gain_error_changes_the_fit_of_a_log_as_its_budget_predicts(
     motion: second_rig.Motion, tmp_path: Path
 ) -> None:
@@ -180,24 +177,27 @@ def test_a_gain_error_changes_the_fit_of_a_log_as_its_budget_predicts(
     compared = 0
     for budget in make_fit_budgets(tuned, rules):
         expected = budget.by_gain["outer_y"]
-        if budget.name in MOTION_KEYS and abs(expected) > 0.3 * budget.contributions["noise"]:
+        if abs(expected) > 0.1 * budget.contributions["noise"]:
             moved = wrong.values[budget.name] - tuned.values[budget.name]
-            assert moved == pytest.approx(expected, rel=0.3), budget.name
+            assert moved == pytest.approx(expected, rel=0.1), budget.name
             compared += 1
-    assert compared >= 2
+    assert compared >= 10
 
 
 @MATRIX
 def test_the_spread_of_ten_logs_is_the_noise_of_the_budget(motion: second_rig.Motion, tmp_path: Path) -> None:
-    # Ten logs determine a standard deviation to 24 %. Clock, pulse and friction spread by more than their noise, as the
-    # simulated pulse has whole ticks; the contribution of the model contains this.
+    # Ten logs determine a standard deviation to 24 %. Logged time and clock offset of the pulse add up to its time.
     fits = [tune_few_channels(tmp_path / str(seed), motion, seed=seed) for seed in range(40, 50)]
-    budgets = {one.name: one for one in make_fit_budgets(fits[0], load_criteria().imported)}
+    found = [
+        fit.values | {"clock.offset_s": fit.values["clock.offset_s"] + get_value(fit.baseline, "hammer.1.at_s")}
+        for fit in fits
+    ]
     ratios = np.array([
-        np.std([fit.values[key] for fit in fits], ddof=1) / budgets[key].contributions["noise"] for key in MOTION_KEYS
+        np.std([values[one.name] for values in found], ddof=1) / one.contributions["noise"]
+        for one in make_fit_budgets(fits[0], load_criteria().imported)
     ])  # fmt: skip
     assert np.sqrt(np.mean(ratios**2)) == pytest.approx(1.0, abs=0.3)
-    assert ((ratios > 0.45) & (ratios < 1.6)).all(), ratios
+    assert ((ratios > 0.25) & (ratios < 1.6)).all(), ratios
 
 
 def test_budget_of_a_log_is_a_page_with_labelled_assumptions(

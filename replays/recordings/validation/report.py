@@ -116,7 +116,7 @@ def _sources(validation: Validation, criteria: Criteria) -> list[tuple[str, str,
     corner = f"; {validation.calibration_line}" if validation.calibration else ""
     fitted, assumed = len(validation.fitted), "assumed: criteria, [imported]"
     return [
-        ("noise", "of each channel", "measured in the log, as white noise", f"samples - {fitted}"),
+        ("noise", "of each channel", "measured in the log, by its spectrum", f"samples - {fitted}"),
         ("calibration", f"{rules.calibration:.2%} of each channel", f"{assumed} calibration", "not known"),
         ("filter", f"{1.0 - rules.bandwidth:.1%} of each corner", f"{assumed} bandwidth{corner}", "not known"),
         ("clock", clock, "assumed: a crystal, a trigger found in filtered samples", "not known"),

@@ -70,15 +70,18 @@ def make_fit_budgets(tuned: Tuned, rules: Imported) -> list[Budget]:
     predictor = Predictor(tuned.baseline, keys, parts, about_s=tuned.about_s)
     there = predictor.derivatives(values)
 
+    def over_noise(values: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """Return values over the noise, whitened as in the fit, by channel."""
+        whitened = {name: part.whiten(values[name]) for name, part in parts.items()}
+        return [one / floor for one, floor in split_channels(parts, whitened)]
+
     def subtract(changed: dict[str, np.ndarray]) -> list[np.ndarray]:
         """Return the prediction minus another one over the noise, by channel."""
-        off = {name: base - changed[name] for name, base in there.base.values.items()}
-        return [one / floor for one, floor in split_channels(parts, off)]
+        return over_noise({name: base - changed[name] for name, base in there.base.values.items()})
 
     recorded = {name: part.values for name, part in parts.items()}
     residuals = [-one for one in subtract(recorded)]
-    slopes = [[one / floor for one, floor in split_channels(parts, slope)] for slope in there.slopes]
-    columns = [np.column_stack(one) for one in zip(*slopes, strict=True)]
+    columns = [np.column_stack(one) for one in zip(*map(over_noise, there.slopes), strict=True)]
     loose = zip(predictor.start, predictor.scales, strict=True)
     means, deviations = np.array([one.prior or wide for one, wide in zip(tuned.fitted, loose, strict=True)]).T
     scales = list(tuned.scales.values())
@@ -103,7 +106,7 @@ def make_fit_budgets(tuned: Tuned, rules: Imported) -> list[Budget]:
     known = [one.prior is not None for one in tuned.fitted]
     pulls = np.abs(inverse) / deviations * known
     clock = np.array([key in CLOCK for key in keys])
-    gains = solve_each([rules.calibration * one / floor for one, floor in split_channels(parts, recorded)])
+    gains = solve_each([rules.calibration * one for one in over_noise(recorded)])
     other = {name: part.with_corner_factor(rules.bandwidth) for name, part in parts.items()}
     variants = [tuned.with_changes(variant.set).predict(parts).values for variant in rules.variants]
     times = [part.times_s for part in parts.values() for _ in part.names]
@@ -162,10 +165,7 @@ def make_quantity_budgets(
         for c in range(values.shape[1]):
             factors = np.where(np.arange(values.shape[1]) == c, 1.0 + rules.calibration, 1.0)
             gains.append(read({**nominal.values, name: values * factors}))
-    noisy = [
-        {n: v + parts[n].floor * generator.standard_normal(v.shape) for n, v in nominal.values.items()}
-        for _ in range(_DRAWS)
-    ]
+    noisy = [{n: v + parts[n].draw_noise(generator, len(v)) for n, v in nominal.values.items()} for _ in range(_DRAWS)]
     changed = {
         "noise": (list(map(read, noisy)), _DRAWS),
         "calibration": (gains, 1),
