@@ -32,7 +32,7 @@ from replays.recordings.identification.agreement import (
 from replays.recordings.identification.request import first_command_s, fit_unit, observe
 from replays.recordings.resimulation.experiment import PICKUP_S, Experiment
 from replays.recordings.resimulation.noise import with_spectra
-from replays.recordings.resimulation.prediction import Measured, Prediction
+from replays.recordings.resimulation.prediction import Measured, Prediction, read_measured
 from replays.recordings.resimulation.sensitivity import (
     ANGLE,
     STATE,
@@ -79,7 +79,7 @@ _MARGIN_S = 2e-3
 _FULL_RATE_S, _DECIMATION = 0.03, 8
 """Time before the hammer pulse from which samples are kept [s], and the decimation factor of earlier ones, which only
 determine the state of the shaft."""
-_WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
+_WINDOWS_S = (4e-3, 8e-3, 13e-3, 18e-3, 24e-3, 30e-3)
 """Lengths of the fit windows from the start of the hammer pulse [s]."""
 _COUNTED_GROWTHS = 2
 """Last growths of the window whose changes of the values represent the error of the model."""
@@ -341,10 +341,7 @@ def tune(
     end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
     whole = observe(recording, baseline, channels=channels, window=(window_start_s(baseline), end_s)).parts
     whole = {name: part.remove_delays(late_s or {}) for name, part in whole.items()}
-    quiet = {name: part.select_until(first_s - _MARGIN_S) for name, part in whole.items()}
-    if all(len(part.times_s) for part in quiet.values()):
-        quiet = with_spectra(quiet, Predictor(baseline, (), quiet).predict(()).values)
-        whole = {name: replace(part, spectra=quiet[name].spectra) for name, part in whole.items()}
+    whole = _with_spectra(recording, baseline, whole, end_s=first_s - _MARGIN_S)
     whole = {name: _decimate(part, first_s - _FULL_RATE_S) for name, part in whole.items()}
     fit = _fit_best(baseline, wanted, whole, progress)
     if max(fit.scales) > _FAULTY_RMS and (early := _with_earlier_pulse(baseline, whole)) is not None:
@@ -376,6 +373,23 @@ def tune(
         spectra={name: one for part in whole.values() for name, one in part.named_spectra if one is not None},
         parts={name: part.select_until(fit.end_s) for name, part in whole.items()},
     )
+
+
+def _with_spectra(
+    recording: Recording, experiment: Experiment, parts: dict[str, Measured], *, end_s: float
+) -> dict[str, Measured]:
+    """Return parts with the spectra of their noise, from all samples of a log before an end [s]."""
+    every = read_measured(recording, experiment.scene)
+    quiet = {
+        name: replace(every[name].select_channels(part.names), floor=part.floor, random=part.random)
+        .select_from(window_start_s(experiment))
+        .select_until(end_s)
+        for name, part in parts.items()
+    }
+    if not experiment.imported or not all(len(part.times_s) for part in quiet.values()):
+        return parts
+    quiet = with_spectra(quiet, Predictor(experiment, (), quiet).predict(()).values)
+    return {name: replace(part, spectra=quiet[name].spectra) for name, part in parts.items()}
 
 
 def _restrict(experiment: Experiment, values: dict[str, float]) -> dict[str, float]:

@@ -444,7 +444,14 @@ def explain_assumed(explained: Explained, recording: Recording, failed: Sequence
         ranked.append(one)
     best = [one for one in explained.ranked if one.name in explained.best]
     if best and all(one.kind == "sensor" for one in best):
-        for name in (name for name in failed if name not in select_channels(best, failed)):
+        known = select_channels(best, failed)
+        rest = [name for name in failed if name not in known]
+        if len(rest) > len(known):
+            # Channels that most others contradict are not the cause, however large their part of the squares is.
+            text = f"{len(rest)} of {len(failed)} channels that fail have no known cause: the model differs, or "
+            conclusion = f"{text}several faults; closest is {conclusion.removeprefix('sensor: ')}"
+            return replace(explained, conclusion=conclusion, ranked=tuple(ranked), best=())
+        for name in rest:
             assumed = f" (assumed: low-pass of {corners[name]:g} Hz)" if name in corners else ""
             conclusion += f"; {name} fails without a known cause{assumed}"
     return replace(explained, conclusion=conclusion, ranked=tuple(ranked))
