@@ -123,6 +123,7 @@ class _Mapping(_Document):
 class _Import(_Document):
     mapping: _Mapping = _Mapping()
     unsure: dict[str, Annotated[_Finite, Field(gt=0.0)]] = {}
+    mark_deg: tuple[_Finite, Annotated[_Finite, Field(gt=0.0)]] | None = None
 
 
 class Scene(_Document):

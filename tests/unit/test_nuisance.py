@@ -22,7 +22,7 @@ from replays.recordings.identification.log import identify_log
 from replays.recordings.identification.nuisance import Tuned, find_nuisances, tune
 from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import predict, read_measured
-from replays.recordings.resimulation.sensitivity import ANGLE, get_value, with_values
+from replays.recordings.resimulation.sensitivity import ANGLE, PHASE, get_value, with_values
 from replays.recordings.validation import load_criteria, validate
 from replays.recordings.validation.explanations.budget import make_fit_budgets
 from replays.recordings.validation.explanations.channel_fit import Shown
@@ -289,8 +289,38 @@ def test_a_clock_is_no_number_of_the_experiment(mils: Recording) -> None:
     experiment = Experiment.from_recording(mils)
     assert with_values(experiment, {"clock.offset_s": 1e-3, "clock.rate_ppm": 3.0}) == experiment
     turned = with_values(experiment, {ANGLE: 0.5, "drive.speed_hz": experiment.scene.drive.speed_hz + 0.01})
-    ahead = get_value(turned, "shaft.unbalance_phase") - get_value(experiment, "shaft.unbalance_phase")
-    assert ahead == pytest.approx(0.5)
+    assert get_value(turned, PHASE) == pytest.approx(get_value(experiment, PHASE))
+    assert get_value(replace(turned, angle=0.0), PHASE) == pytest.approx(get_value(experiment, PHASE) + 0.5)
+
+
+def import_marked_log(folder: Path, angle: str, phi: float = 0.21) -> Recording:
+    """Return a log of probes, hammer and keyphasor, with keys of the mapping's [keyphasor]; its edges are at 0."""
+    own = second_rig.simulate_pulse(second_rig.Rig(phi=phi), turned=TURNED, before_s=0.35, after_s=0.02, settled_s=2.0)
+    own_s, values = second_rig.record_log(own, seed=8, rate_hz=10_000.0, ppm=PPM, bandwidth_hz=4000.0)
+    names = ("ring_x", "ring_y", "hammer")
+    mapping = "".join(f'[channels.{name}]\nsource = "{name}"\nbandwidth_hz = 4000\n' for name in names)
+    columns = {f"{name} [{second_rig.UNITS[name]}]": values[name] for name in names} | {"key": values["keyphasor"]}
+    return import_log(folder, {"time [s]": own_s, **columns}, f'[keyphasor]\nsource = "key"\n{angle}\n{mapping}')
+
+
+@pytest.mark.parametrize(("angle", "verdict", "line"), [
+    ("", "pass", r"shaft angle: [-+]0\.\d+ .* not compared \(needs edges and \[keyphasor\] angle_deg\)"),
+    ("angle_deg = 2", "pass", r"keyphasor mark: -[12]\.?\d* ±\S+ degrees from angle_deg, or from shaft.unb"),
+    ("angle_deg = 46", "fail, outside the known uncertainty: keyphasor mark: -46", "keyphasor mark: -46"),
+])  # fmt: skip
+def test_the_mark_of_the_keyphasor_is_compared(angle: str, verdict: str, line: str, tmp_path: Path) -> None:
+    found = validate(import_marked_log(tmp_path, angle))
+    assert found.verdict_line.startswith(verdict)
+    (text,) = (one.line for one in found.fitted if one.key == ANGLE)
+    assert re.match(line, text)
+
+
+def test_a_known_mark_gives_the_phase_of_unbalance(tmp_path: Path) -> None:
+    log = import_marked_log(tmp_path, "angle_deg = 0", phi=0.7)
+    phase = identify_log(log, Experiment.from_recording(log), [PHASE]).judgement.findings[0]
+    assert (phase.unknown.key, phase.standing) == (PHASE, "identified")
+    assert phase.value == pytest.approx(0.7, abs=0.02)
+    assert 1.96 * math.radians(5.0) <= phase.half_width < 0.25
 
 
 def test_nuisances_are_those_of_the_experiment() -> None:

@@ -161,6 +161,7 @@ def convert(
         "channels": {channel.name: channel.document() for channel in channels},
         "remarks": remarks,
         **({"unsure": experiment.unsure} if experiment is not None and experiment.unsure else {}),
+        **({"mark_deg": mark} if (mark := mapping.mark_deg) is not None else {}),
     }
     return Conversion(
         table=table, counts=counts, present=present, first_s=first_s, rates_hz=rates_hz, edges=edges, pulses=kept,

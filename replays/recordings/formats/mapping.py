@@ -226,6 +226,11 @@ class KeyphasorMapping(SignalName):
     hysteresis: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
     """Distance by which the signal must fall back before the next edge counts; omitted: a tenth of its range."""
     pulses_per_turn: Annotated[int, Field(ge=1)] = 1
+    angle_deg: FiniteFloat | None = None
+    """Angle of the shaft at the edge: direction of its zero mark, from which `shaft.unbalance_phase` counts, from x
+    (EAST) toward y (up) [degrees]; omitted: unknown."""
+    angle_uncertainty_deg: PositiveFloat = 5.0
+    """Standard deviation of `angle_deg` [degrees]."""
 
 
 class HammerMapping(_Section):
@@ -273,6 +278,12 @@ class Mapping(_Section):
     keyphasor: KeyphasorMapping | None = None
     hammer: HammerMapping | None = None
     experiment: ExperimentMapping | None = None
+
+    @property
+    def mark_deg(self) -> tuple[float, float] | None:
+        """Angle of the shaft at the keyphasor's edge and its standard deviation [degrees]; None if unknown."""
+        mark = self.keyphasor
+        return None if mark is None or mark.angle_deg is None else (mark.angle_deg, mark.angle_uncertainty_deg)
 
     def document(self) -> dict[str, Any]:
         """Return the mapping as JSON, without defaults."""

@@ -23,6 +23,7 @@ from replays.recordings.identification.request import Question, ask, first_comma
 from replays.recordings.identification.window import Window
 from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured
+from replays.recordings.resimulation.sensitivity import ANGLE, PHASE
 
 
 def identify_log(
@@ -59,11 +60,14 @@ def identify_log(
     """
     # Report errors of the request before the long search.
     first = ask(recording, experiment, keys, start=start, bounds=bounds, priors=priors, channels=channels)
+    # Samples show the sum of both angles: with a known mark, that of the shaft widens the interval of the other.
+    mark = experiment.mark if PHASE in keys and ANGLE not in keys else None
+    along = [key for key in NUISANCES if key not in keys and (mark is None or key != ANGLE)]
     tuned = tune(
-        recording, first.experiment, (*keys, *(key for key in NUISANCES if key not in keys)), priors=priors or {},
+        recording, first.experiment, (*keys, *along), priors=priors or {},
         channels=channels, to_s=to_s, progress=progress,
     )  # fmt: skip
-    nuisances = find_nuisances(tuned.baseline, NUISANCES, excluded=keys)
+    nuisances = find_nuisances(tuned.baseline, along)
     all_priors = {key: prior for key, prior in nuisances.items() if prior is not None} | dict(priors or {})
     question = ask(
         recording, tuned.baseline, (*keys, *nuisances), start=tuned.values, bounds=bounds, priors=all_priors,
@@ -98,6 +102,8 @@ def identify_log(
     for one in shown:
         change = solve_normal(square + flat.T @ flat, flat.T @ np.nan_to_num(one - residuals).ravel())
         moved = np.hypot(moved, np.abs(change))
+    if mark is not None:
+        moved[question.keys.index(PHASE)] += 1.96 * mark[1]
     judgement = judge(window, z, slopes, residuals, valid)
     nominal = {one.key: one.start for one in tuned.fitted}
     judgement = replace(judgement, findings=tuple(

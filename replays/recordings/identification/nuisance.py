@@ -35,6 +35,7 @@ from replays.recordings.resimulation.noise import with_spectra
 from replays.recordings.resimulation.prediction import Measured, Prediction, read_measured
 from replays.recordings.resimulation.sensitivity import (
     ANGLE,
+    PHASE,
     STATE,
     Predictor,
     get_scale,
@@ -127,6 +128,12 @@ class Fitted:
             return f"time: hammer pulse shifted by {late:+.1f} ±{1e6 * self.half_width:.2g} µs, fitted"
         if self.key == "clock.rate_ppm":
             return f"clock: {self.value:+.1f} ±{self.half_width:.2g} ppm fast, fitted"
+        if self.key == ANGLE:
+            off = math.degrees(self.value - (self.prior[0] if self.prior else 0.0))
+            text = f"{off:+.3g} ±{math.degrees(self.half_width):.2g} degrees"
+            if self.prior is None:
+                return f"shaft angle: {text}, fitted; not compared (needs edges and [keyphasor] angle_deg)"
+            return f"keyphasor mark: {text} from angle_deg, or from {PHASE}, fitted"
         unit = fit_unit(self.key)
         text = f"{format_with_half_width(self.value, self.half_width)}{f' {unit}' * (unit not in ('', '1'))}"
         change = self.value - self.start
@@ -221,6 +228,9 @@ def find_nuisances(
             value = get_value(experiment, key)
         except InputError:
             continue  # no hammer pulse
+        if key == ANGLE and (mark := experiment.mark) is not None:
+            priors[key] = (value + math.remainder(mark[0] - value, 2.0 * math.pi), mark[1])
+            continue
         deviation = experiment.unsure.get(key) or _DEVIATIONS.get(key) or _RELATIVE.get(key, 0.0) * abs(value)
         priors[key] = (value, deviation) if deviation else None
     return priors
@@ -330,7 +340,9 @@ def tune(
         InputError: There are no samples, or none before the pulse.
     """
     progress("speed, angle and position of the shaft before the hammer pulse")
-    baseline = fit_initial_state(recording, experiment) if ANGLE in keys else experiment
+    held = experiment.mark if PHASE in keys and ANGLE not in keys else None  # the phase of unbalance instead
+    baseline = fit_initial_state(recording, experiment) if ANGLE in keys or held else experiment
+    baseline = replace(baseline, angle=held[0]) if held else baseline
     wanted = find_nuisances(baseline, keys) | dict(priors or {})
     first_s = _pulse_time_s(baseline)
     if first_s <= window_start_s(baseline):

@@ -41,6 +41,8 @@ class Experiment:
         first_s: Simulated time at which the recording begins [s].
         begin: Initial state of a log from a running rig; None: the scene's own start at time 0.
         unsure: Standard deviation of values without their own channel, by key, in their unit.
+        angle: Angle of the shaft in addition to `begin`, included in the scene's `shaft.unbalance_phase` [rad].
+        mark: Known value of `angle` from the mark of the keyphasor, and its standard deviation [rad], or None.
         imported: Whether it is that of a log of another system.
     """
 
@@ -49,6 +51,8 @@ class Experiment:
     first_s: float = 0.0
     begin: MotionStart | None = None
     unsure: Mapping[str, float] = field(default_factory=dict)
+    angle: float = 0.0
+    mark: tuple[float, float] | None = None
     imported: bool = False
 
     @classmethod
@@ -74,8 +78,10 @@ class Experiment:
         ]
         first_s = min(float(stream.first_time_s) for stream in streams)
         begin = _initial_state(recording, scene, first_s) if starts_while_running(recording) else None
-        unsure = recording.scene.get("import", {}).get("unsure", {})
-        return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=unsure,
+        document = recording.scene.get("import", {})
+        mark = document.get("mark_deg") if begin is not None and len(_find_first_edges(recording, scene)) > 1 else None
+        return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=document.get("unsure", {}),
+                   mark=mark and (math.radians(mark[0]), math.radians(mark[1])),
                    imported=is_imported(recording))  # fmt: skip
 
     def with_changes(self, changes: dict[str, Any]) -> Experiment:
@@ -138,14 +144,19 @@ def _initial_state(recording: Recording, scene: Scene, first_s: float) -> Motion
     """Return the initial state of such a log: shortly before the hammer pulse, at the angle of the edges."""
     hammer_s = min((timed.at_s for timed in scene.commands), default=first_s)
     begin_s = math.floor(round(max(first_s, hammer_s - PICKUP_S) / GRID_S, 6)) * GRID_S
-    edges_s = recording.edges()
-    edges_s = edges_s[edges_s < hammer_s] if scene.commands else edges_s  # the shaft slows down after the pulse
+    edges_s = _find_first_edges(recording, scene)
     if len(edges_s) < 2:
         turns = (begin_s - edges_s.sum()) * scene.drive.speed_hz if len(edges_s) else 0.0
         return MotionStart(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
     near = max(0, min(int(np.searchsorted(edges_s, begin_s)) - 1, len(edges_s) - 2))
     turns = (begin_s - edges_s[near]) / (edges_s[near + 1] - edges_s[near])
     return MotionStart(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
+
+
+def _find_first_edges(recording: Recording, scene: Scene) -> np.ndarray:
+    """Return the edges before the first command, after which the shaft slows down, shape (n,) [s]."""
+    edges_s = recording.edges()
+    return edges_s[edges_s < min((timed.at_s for timed in scene.commands), default=math.inf)]
 
 
 def _end_s(recording: Recording) -> float:

@@ -31,7 +31,9 @@ from rig.run.simulation import TICK_RATE_HZ
 CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
 """Delay of the recording's clock at its first sample, and its relative rate error: unit, size of a unit change."""
 ANGLE = "shaft.angle_rad"
-"""Angle of the shaft at the first sample relative to the experiment [rad], independent of the speed before."""
+"""Angle of the shaft at the first sample, relative to that of the edges or of the scene [rad], independent of the speed
+before. For a log it is that at an edge."""
+PHASE = "shaft.unbalance_phase"
 STATE = {f"state.{name}": (unit, si, scale) for name, unit, si, scale in (
     ("ring_x", "mm", 1e-3, 0.1), ("ring_y", "mm", 1e-3, 0.1), ("vx", "mm/s", 1e-3, 10.0), ("vy", "mm/s", 1e-3, 10.0),
 )}  # fmt: skip
@@ -76,8 +78,10 @@ def get_value(experiment: Experiment, key: str) -> float:
     Raises:
         InputError: There is no such number.
     """
-    if key in CLOCK or key == ANGLE:
+    if key in CLOCK:
         return 0.0
+    if key == ANGLE:
+        return experiment.angle
     if key in STATE:
         return float(getattr(_get_begin(experiment, key), key.split(".")[1])) / STATE[key][1]
     match = _COMMAND_KEY.fullmatch(key)
@@ -92,6 +96,8 @@ def get_value(experiment: Experiment, key: str) -> float:
         if isinstance(value, int | float):
             return float(value)
         raise InputError(key, f"a number of the command {match[1]}", field)
+    if key == PHASE and experiment.angle:
+        return math.remainder(get_value(replace(experiment, angle=0.0), PHASE) - experiment.angle, 2.0 * math.pi)
     if key in load_parameters().entries:
         value = experiment.scene.load_parameters().entries[key].value
         return _resolve(experiment.scene)[key] if isinstance(value, str) else float(value)
@@ -115,12 +121,14 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
         begin = _get_begin(experiment, next(key for key in values if key in STATE))
         experiment = replace(experiment, begin=begin._replace(**placed))
     values = {key: value for key, value in values.items() if key not in CLOCK and key not in STATE}
-    if ANGLE in values:
-        phase = get_value(experiment, "shaft.unbalance_phase") + values.pop(ANGLE)
+    if ANGLE in values or (PHASE in values and experiment.angle):
+        angle = values.pop(ANGLE, experiment.angle)
+        phase = values.get(PHASE, get_value(experiment, PHASE)) + angle
         if experiment.begin is None:
             ahead = values.get("drive.speed_hz", experiment.scene.drive.speed_hz) - experiment.scene.drive.speed_hz
             phase -= 2.0 * math.pi * ahead * experiment.first_s
-        values["shaft.unbalance_phase"] = math.remainder(phase, 2.0 * math.pi)
+        values[PHASE] = math.remainder(phase, 2.0 * math.pi)
+        experiment = replace(experiment, angle=angle)
     changes = {key: value for key, value in values.items() if _COMMAND_KEY.fullmatch(key) is None}
     scene = change_scene(experiment.scene, changes) if changes else experiment.scene
     changed = replace(experiment, scene=scene)
@@ -159,7 +167,7 @@ def get_scale(experiment: Experiment, key: str) -> float:
     """Return the size of a unit change of a value, in its unit: the value itself, or a related length or time."""
     if key in ("ring.offset_x", "ring.offset_y"):
         return get_value(experiment, "ring.clearance")
-    if key in ("shaft.unbalance_phase", ANGLE):
+    if key in (PHASE, ANGLE):
         return 1.0
     if key in CLOCK:
         return CLOCK[key][1]

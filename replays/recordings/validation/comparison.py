@@ -139,10 +139,10 @@ def validate(
             "the known experiment causes no contact: a hammer pulse may be missing from the mapping ([[commands]])",
         ))  # fmt: skip
     if not firsts and again.tuned is not None and not again.faults:
-        return replace(validation, explained=_unexplained(
-            end, "up to there all channels agree; the later difference is due to contact (`rig identify --fit "
-            "contact.friction,contact.restitution`), ring or housing, or to a sensor that changes there",
-        ))  # fmt: skip
+        text = "up to there all channels agree; the later difference is due to contact (`rig identify --fit "
+        text += "contact.friction,contact.restitution`), ring or housing, or to a sensor that changes there"
+        text = text if validation.failures else f"outside the known uncertainty: {'; '.join(validation.beyond)}"
+        return replace(validation, explained=_unexplained(end, text))
     if not firsts:
         return validation
     again = again.select_causes(min(firsts), touched)
