@@ -227,6 +227,8 @@ def explain_log(
         also = f"; {conclusion}" if best else ""
         best = (*(one.key for one in far), *best)
         conclusion = "outside the known uncertainty: " + "; ".join(one.line for one in far) + also
+    elif not best and cured and "closest is sensor" in conclusion:
+        pass  # the defect of a channel, of which the rest is more than noise
     elif not best and faults:
         conclusion = f"first repair the faults of signals: {'; '.join(one.line for one in faults)}"
     elif not best and float(np.median(list(tuned.scales.values()))) > _MAX_MEDIAN_RESIDUAL:
@@ -494,8 +496,10 @@ def conclude(
         if also:
             text = f"sensor: {text}, or {_list(also)} explain it equally; this recording does not distinguish them"
             return text, (*names, *(one.name for one in also))
-        beyond = f"; {rest:.2g} times the noise is left" if (rest := max(one.left for one in cured)) > _NOISE else ""
-        return f"sensor: {text} ({min(1.0, most):.1%} of the difference{beyond})", names
+        if (rest := max(one.left for one in cured)) > _NOISE:
+            part = f"{min(1.0, most):.1%} of the difference; {rest:.2g} times the noise is left"
+            return f"no known defect explains it down to the noise; closest is sensor: {text} ({part})", ()
+        return f"sensor: {text} ({min(1.0, most):.1%} of the difference)", names
     if single is None or single.explained < rules.enough:
         most = f"; the most is {single.name} with {single.explained:.0%}" if single else ""
         return f"no single candidate explains it{most}", ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,8 @@ _MIN_REDUCTION = 0.05
 """Reduction of the residual's logarithm per number, if all except for the channel is known to the bit."""
 _BEGIN_ROWS = 4.5
 """Rows about the first different one in which the signal's value is searched."""
+_MAX_LEVEL_PART = 0.5
+"""Largest residual of a log's law with a level relative to that of the level alone."""
 OUTLIER = 6.0
 """Deviation of a sample in floors that is not noise."""
 
@@ -87,9 +89,20 @@ class Shown:
     @cached_property
     def price(self) -> float:
         """Least sum of squares that an additional number must remove, above noise and a part of other errors."""
-        level = np.ones(len(self.values))  # the level may be off by far more than the motion
-        residual = self.solve([level], self.values - self.expected)[1]
-        return max(MARGIN, _MIN_SECOND_PART * float(residual @ residual))
+        residual = self.solve([np.ones(len(self.values))], self.values - self.expected)[1]
+        return max(MARGIN, _MIN_SECOND_PART * float(residual @ residual))  # a level may exceed the motion by far
+
+    @cached_property
+    def without_level(self) -> np.ndarray:
+        """Residual of a level alone, shape (n,)."""
+        return self.solve([self.level], self.values - self.expected)[1]
+
+    def exceeds_level(self, residual: np.ndarray) -> bool:
+        """Return whether a law with a residual, shape (n,), explains most of what a level alone leaves, in a log."""
+        n, alone = len(self.values), self.without_level
+        return self.counts is not None or float(residual @ residual) - n <= max(
+            0.0, _MAX_LEVEL_PART * (float(alone @ alone) - n)
+        )
 
     def cost(self, residual: np.ndarray, count: int) -> float:
         """Return the cost of a law by its number of parameters and its residual over the floor, shape (n,) or fewer."""
@@ -236,3 +249,28 @@ def gain_words(gain: float) -> tuple[str, str]:
     if abs(gain) < 0.05 and not slip:
         return "signal", "missing"
     return "gain", size_text("gain", gain - 1.0) + (f" ({slip})" if slip else "")
+
+
+def with_level(one: Shown, law: Law, level: float, bare: np.ndarray) -> Iterator[Law]:
+    """Yield a law with its level stated; for a log, only if it explains most of what the level alone leaves.
+
+    Args:
+        one: The channel.
+        law: A law that was fitted together with a level.
+        level: The level.
+        bare: Residual of the law without a level.
+    """
+    if one.counts is not None:
+        yield law
+        return
+    alone, before, n = one.without_level, one.apart, len(one.values)
+    if not one.exceeds_level(law.residual):
+        return
+    if float(bare @ bare) < float(law.residual @ law.residual) + one.price:
+        yield law
+        return
+    texts, names = [law.change, size_text("offset", level, one.unit)], [law.name, "offset"]
+    value, unit = law.value, law.unit
+    if law.name != "drift" and before @ before + n > 2.0 * float(alone @ alone):
+        texts, names, value, unit = texts[::-1], names[::-1], level, one.unit
+    yield replace(law, name=" and ".join(names), change=", ".join(texts), value=value, unit=unit)

@@ -20,10 +20,11 @@ from replays.recordings.validation.explanations.channel_fit import (
     gain_words,
     least_at,
     rms_of,
+    with_level,
 )
 from replays.recordings.validation.explanations.explanation import excess, is_noise
-from replays.recordings.validation.explanations.signals import steady_rows
-from replays.recordings.validation.explanations.timing import delayed_by, filtered, late, ringing
+from replays.recordings.validation.explanations.signals import RAIL_ROWS, steady_rows
+from replays.recordings.validation.explanations.timing import ac_coupled, delayed_by, filtered, late, ringing
 from rig.channels.faults.defects import DEFECTS, size_text
 
 _EXACT_PART = 0.01
@@ -50,6 +51,8 @@ _MIN_NOISE_RATIO = 1.6
 """Smallest ratio of noises at which independent additional noise is distinguished from resampled noise."""
 _MAX_NOISE_FACTOR = 1.6
 """Largest residual of two independent noises, relative to one."""
+_MAX_STRETCH_PART = 0.5
+"""Largest part of the time with another gain, for the gain to have changed for a time."""
 _ALL_PART = 0.95
 """Part of the rows above which all count as affected."""
 _LEVEL_PART, _FADING_PART = 1e-3, 0.02
@@ -69,18 +72,18 @@ _MAX_SPIKE_PART = 0.3
 def law_of(one: Shown) -> Law:
     """Return the simplest law of a channel that leaves noise, or else the one with the least residual."""
     before = one.apart
-    for law in _fit_steps(one) if one.counts is None else _fit_counts(one, one.counts):
+    for law in [*_fit_steps(one), *_fit_rails(one)] if one.counts is None else _fit_counts(one, one.counts):
         return law
     held = steady_rows(one.values) if one.noise > 0.0 and one.counts is None else np.zeros(len(before), dtype=bool)
     if held.any() and excess(before[held]) > 0.5 * excess(before):
         times_s = one.times_s[held]
         return one.law("freeze", 0.0, before[~held], 1, f"from {times_s[0]:.4f} s, {len(times_s)} rows")
-    laws = [*_fit_levels(one), *_fit_times(one)]
+    laws = [*_fit_levels(one), *_fit_times(one), *_fit_parts(one)]
     if one.moves or one.counts is not None:
         laws += _fit_crosstalk(one)
         laws += _fit_curves(one)
     if one.moves and one.even:
-        laws += [*late(one), *filtered(one)]
+        laws += [*late(one), *filtered(one), *ac_coupled(one)]
     best = min((law for law in laws if law.sure), key=lambda law: one.cost(law.residual, law.count))
     rings = cache(lambda: list(ringing(one)))
     if one.counts is not None:
@@ -163,6 +166,38 @@ def _fit_steps(one: Shown) -> Iterator[Law]:
         yield one.law("bits", step, residual, 1, f"in steps of {step:.4g} {one.unit}", unit=one.unit)
 
 
+def _fit_rails(one: Shown) -> Iterator[Law]:
+    """Yield limits at which a log's channel has equal numbers, if its expected signal exceeds them."""
+    ends = [float(end) for end in (one.values.min(), one.values.max())]
+    at = [int(np.count_nonzero(one.values == end)) >= RAIL_ROWS for end in ends]
+    low, high = (end if there else sign * math.inf for end, there, sign in zip(ends, at, (-1.0, 1.0), strict=True))
+    residual = (one.values - np.clip(one.expected, low, high)) / one.floor
+    if low < high and excess(residual) < _EXPLAINED_PART * excess(one.apart):
+        text = " and ".join(f"{end:.4g} {one.unit}" for end, there in zip(ends, at, strict=True) if there)
+        yield one.law("clip", high if at[1] else low, residual, at.count(True), f"at {text}", unit=one.unit)
+
+
+def _fit_parts(one: Shown) -> Iterator[Law]:
+    """Yield, for a log, a gain during a part of the time, and values that wrap around at the ends of the range."""
+    d, off = one.values - one.expected, np.flatnonzero(np.abs(one.apart) > OUTLIER)
+    if one.counts is not None or not len(off):
+        return
+    rows = slice(off[0], off[-1] + 1)
+    if MIN_ROWS <= rows.stop - rows.start < _MAX_STRETCH_PART * len(d):
+        weights = (one.expected / one.floor)[rows]
+        gain = float(weights @ (one.values / one.floor)[rows] / max(float(weights @ weights), 1e-300))
+        factors = np.ones(len(d))
+        factors[rows] = gain
+        begin_s, end_s = one.times_s[[rows.start, rows.stop - 1]]
+        change = f"{size_text('gain', gain - 1.0)} from {begin_s:.4f} to {end_s:.4f} s"
+        yield one.law("gain", gain - 1.0, (one.values - factors * one.expected) / one.floor, 3, change)
+    span = float(np.median(np.abs(d)[np.abs(d) > 0.5 * np.abs(d).max()]))
+    turns = np.rint(d / span)
+    span = float(turns @ d / max(float(turns @ turns), 1.0))
+    if np.ptp(one.values) < span + 2.0 * OUTLIER * one.noise and turns.any() and not turns.all():
+        yield one.law("wrap", span, (d - span * turns) / one.floor, 2)
+
+
 def _make_spikes(one: Shown, rows: np.ndarray, residual: np.ndarray) -> Law:
     size = float(np.median(np.abs(one.values - one.expected)[rows]))
     rate = rows.sum() / max(float(one.times_s[-1] - one.times_s[0]), 1e-9)
@@ -184,6 +219,8 @@ def _fit_levels(one: Shown) -> Iterator[Law]:
         what, change = gain_words(gain := float(factors[0]))
         if (what == "signal" and one.counts is not None) or (rests and abs(float(e.mean())) < one.noise):
             continue  # the level is more specific
+        if len(columns) > 1 and not one.exceeds_level(residual):
+            continue
         if len(columns) > 1 and what == "gain" and not coupled:
             what, change = "gain and offset", f"{change}, {size_text('offset', factors[1], one.unit)}"
         numbers = {"gain": gain - 1.0} if "gain" in what else {}
@@ -214,17 +251,20 @@ def _fit_times(one: Shown) -> Iterator[Law]:
     t, d = one.times_s - one.times_s[0], one.values - one.expected
     ones, length_s = one.level, float(one.times_s[-1] - one.times_s[0])
     held = 2.0 * math.pi * one.channel.highpass_hz if one.counts is not None else 0.0
-    (rate, _), residual = one.solve([(1.0 - ones) / held if held else t, ones], d)
-    yield one.law("drift", float(rate), residual, 2)
+    slope = (1.0 - ones) / held if held else t
+    (rate, level), residual = one.solve([slope, ones], d)
+    law = one.law("drift", float(rate), residual, 2)
+    yield from with_level(one, law, float(level), one.solve([slope], d)[1])
 
     def levelling(log_s: float) -> tuple[np.ndarray, np.ndarray]:
         return one.solve([-np.exp(-t / math.exp(log_s)), ones], d)
 
     ends = math.log(0.01 * length_s), math.log(3.0 * length_s)
     log_s = least_at(lambda log_s: rms_of(levelling(log_s)[1]), *ends)
-    (far, _), residual = levelling(log_s)
+    (far, level), residual = levelling(log_s)
     change = f"{far:+.4g} {one.unit} in {math.exp(log_s):.3g} s"
-    yield one.law("drift", float(far), residual, 3, change, unit=one.unit)
+    law = one.law("drift", float(far), residual, 3, change, unit=one.unit)
+    yield from with_level(one, law, float(level - far), one.solve([1.0 - np.exp(-t / math.exp(log_s))], d)[1])
     if not one.uniform:
         return
     period_s = length_s / (len(t) - 1)
@@ -251,7 +291,8 @@ def _fit_times(one: Shown) -> Iterator[Law]:
         if alone and math.hypot(*own[1:]) > _MAX_OWN_LINE * amplitude and not is_noise(residual):
             continue
         change = f"{f:.5g} Hz, {amplitude:.4g} {one.unit}" + (" with its third" if third else "")
-        yield one.law("hum", amplitude, residual, 6 if third else 4, change)
+        law = one.law("hum", amplitude, residual, 6 if third else 4, change)
+        yield from with_level(one, law, float(factors[0]), one.solve(columns(f, third)[1:], d)[1])
 
 
 def _fit_crosstalk(one: Shown) -> Iterator[Law]:
@@ -259,14 +300,18 @@ def _fit_crosstalk(one: Shown) -> Iterator[Law]:
     d, ones = one.values - one.expected, one.level
     laws, count = list[Law](), 4 if one.counts is None else 2
     for other, shown in one.neighbours().items():
-        (part, _), residual = one.solve([one.coupled(*shown), ones], d)
+        signal = one.coupled(*shown)
+        (part, level), residual = one.solve([signal, ones], d)
         through = abs(part * one.channel.sensitivity_v / other.sensitivity_v)
         change = f"{part:.4g} {one.unit} for a {other.unit} of {other.name}"
         if one.counts is not None and through > 1.0:
             continue  # it cannot be larger than at its source
         if one.counts is not None and through > 0.0:
             change = f"{20.0 * math.log10(through):.3g} dB of {other.name}"
-        laws.append(one.law("crosstalk", float(part), residual, count, change, unit=""))
+        law = one.law("crosstalk", float(part), residual, count, change, unit="")
+        middle = float(signal.mean())
+        bare = min((one.solve([signal - about], d)[1] for about in (0.0, middle)), key=rms_of)
+        laws += with_level(one, law, float(level + part * middle), bare)
     if laws:
         # Channels with equal signals, such as opposite sides of a ring, are one source.
         best = min(laws, key=lambda law: one.cost(law.residual, count))

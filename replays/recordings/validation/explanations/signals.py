@@ -15,7 +15,7 @@ _MIN_FROZEN_ROWS = 8
 """Fewest consecutive equal numbers that noise does not cause."""
 _MAX_EQUAL_PART = 0.02
 """Largest part of equal neighbours elsewhere, for a stretch to be frozen."""
-_RAIL_RUN, _RAIL_ROWS = 2, 4
+_RAIL_RUN, RAIL_ROWS = 2, 4
 """Fewest rows at the largest or smallest number for a rail: consecutive, and in all."""
 _UNEVENNESS, _UNEVENNESS_S = 8.0, 5e-5
 """Deviation of an uneven turn: in standard deviations of turns, and absolute."""
@@ -136,8 +136,9 @@ def edge_faults(
     even = len(steps) if len(steps) >= 3 else 0
     later = np.diff(edges_s[max(0, even - 1) :])
     neighbours = np.maximum([*later[1:2], *later[:-1]], [*later[1:], math.inf]) if len(later) > 1 else later
-    # A shaft cannot be that much slower for a single turn.
-    for at in np.flatnonzero(later > _MISSED_TURN * neighbours) + max(0, even - 1):
+    # A shaft cannot be that much slower for a single turn, and a missing pulse leaves more than a turn at its speed.
+    missing = (later > _MISSED_TURN * neighbours) & ((later * speed_hz > _MISSED_TURN) | (speed_hz <= 0.0))
+    for at in np.flatnonzero(missing) + max(0, even - 1):
         begin, end = float(edges_s[at]), float(edges_s[at + 1])
         text = f"none between {begin:.3f} and {end:.3f} s"
         faults.append(SignalFault("keyphasor", "miss-pulses", begin, end, text))
@@ -175,7 +176,7 @@ def _find_held_values(name: str, unit: str, times_s: np.ndarray, values: np.ndar
     for side, level in (("largest", values.max()), ("smallest", values.min())):
         at = steady_rows(np.where(values == level, level, np.arange(len(values)) + level + 1.0), _RAIL_RUN)
         runs = find_true_runs(at)
-        if at.sum() >= _RAIL_ROWS and (len(runs) > 1 or at.sum() < _MIN_FROZEN_ROWS):
+        if at.sum() >= RAIL_ROWS and (len(runs) > 1 or at.sum() < _MIN_FROZEN_ROWS):
             rails |= at
             text = f"{at.sum()} rows at its {side}, {level:.6g} {unit}, the first at {times_s[runs[0][0]]:.4f} s"
             faults.append(SignalFault(name, "clip", *_find_span(times_s, runs), text))

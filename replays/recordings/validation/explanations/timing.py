@@ -20,6 +20,7 @@ from replays.recordings.validation.explanations.channel_fit import (
     gain_words,
     least_at,
     rms_of,
+    with_level,
 )
 from rig.channels.faults.defects import size_text
 from rig.channels.sensors.filters import low_pass_response
@@ -58,6 +59,8 @@ _MAX_CORNER_RATIO, _MIN_RESPONSE = 2.0, 1e-3
 """Largest corner tried, relative to the told one, and smallest response of the told filter that is inverted."""
 _MIN_SETTLED_PART = 0.3
 """Part of the difference that must remain after a filter has settled."""
+_MIN_COUPLING_TURNS, _MAX_COUPLING_PART = 0.02, 0.05
+"""Lowest corner of an AC coupling that is searched, in periods in the window, and highest, as part of the rate."""
 _MAX_NOISE_PART = 0.8
 """Residual over noise below which it contains no independent noise."""
 
@@ -74,7 +77,7 @@ def late(one: Shown) -> Iterator[Law]:
         (shift,), residual = one.solve([ones], one.values - delayed)
         change, of = size_text("delay", late_s), {"delay": late_s}
         yield one.law("delay", late_s, (one.values - delayed) / one.floor, numbers=of)
-        if abs(shift) > one.noise:
+        if abs(shift) > one.noise and one.exceeds_level(residual):
             text = f"{change}, {size_text('offset', shift, one.unit)}"
             yield one.law("delay and offset", late_s, residual, 2, text, numbers=of)
         if one.counts is not None and abs(late_s) < -_MIN_DELAY_S:
@@ -84,7 +87,10 @@ def late(one: Shown) -> Iterator[Law]:
             what, also = gain_words(gain := float(factors[0]))
             if what == "signal":
                 continue  # a missing signal has no delay
-            yield one.law(f"{what} and delay", gain - 1.0, residual, 1 + len(columns), f"{also}, {change}", numbers=of)
+            count, text = 1 + len(columns), f"{also}, {change}"
+            law = one.law(f"{what} and delay", gain - 1.0, residual, count, text, numbers=of)
+            bare = one.solve([delayed])[1]
+            yield from with_level(one, law, float([*factors, 0.0][1]), bare)
     if one.counts is None or one.channel.signal == "keyphasor":
         return  # a log's common time is fitted earlier; pulses are judged by their edges
     at, delays = _find_delays(one)
@@ -229,6 +235,36 @@ def filtered(one: Shown) -> Iterator[Law]:
     if one.bare is not None and (rms_of(residual_by(1.0)) < _MAX_ALIAS_PART * rms_of(one.apart)):
         column = one.level if channel.highpass_hz else np.zeros(len(one.values))
         yield one.law("no-filter", 0.0, one.solve([column], one.values - one.bare())[1])
+
+
+def ac_coupled(one: Shown) -> Iterator[Law]:
+    """Yield, for a log, an AC coupling of a higher corner than told: a first-order high-pass, already settling."""
+    if one.counts is not None or not one.uniform:
+        return
+    from scipy.signal import lfilter
+
+    told, t = 2.0 * math.pi * one.channel.highpass_hz, one.times_s - one.times_s[0]
+    doubled = np.concatenate([one.expected[:1], one.expected])
+
+    def through(log_hz: float) -> np.ndarray:
+        """Return the residual: the high-pass subtracts a low-pass of the signal, whose initial value is fitted."""
+        held = 2.0 * math.pi * math.exp(log_hz)
+        kept = math.exp(-held * one.period_s)
+        slow = lfilter([0.5 - 0.5 * kept] * 2, [1.0, -kept], doubled)[1:]
+        shown = one.expected - (1.0 - told / held) * slow
+        return one.solve([np.exp(-held * t)], one.values - shown)[1]
+
+    low, high = max(one.channel.highpass_hz, _MIN_COUPLING_TURNS / t[-1]), _MAX_COUPLING_PART / one.period_s
+    if not low < high:
+        return
+    grid = np.log(np.geomspace(low, high, 40))
+    near, step = min(grid, key=lambda log_hz: rms_of(through(log_hz))), grid[1] - grid[0]
+    log_hz = least_at(lambda log_hz: rms_of(through(log_hz)), max(near - step, grid[0]), min(near + step, grid[-1]))
+    hz, residual = math.exp(log_hz), through(log_hz)
+    # Ends of the search range are no corner.
+    if low / _MAX_RATIO < hz < high * _MAX_RATIO and one.exceeds_level(residual):
+        change = f"{size_text('AC coupling', hz)}, told {one.channel.highpass_hz:g} Hz" if told else ""
+        yield one.law("AC coupling", hz, residual, 2, change)
 
 
 def _find_wave(one: Shown) -> tuple[int, Spectrum]:

@@ -1,0 +1,118 @@
+"""Names of defects in a log's channels, from synthetic signals with a known defect."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from replays.recordings.validation.criteria import load_criteria
+from replays.recordings.validation.explanations.attribution import conclude
+from replays.recordings.validation.explanations.channel_fit import Shown
+from replays.recordings.validation.explanations.explanation import Explanation
+from replays.recordings.validation.explanations.faults import diagnose
+from replays.recordings.validation.explanations.signals import edge_faults
+from rig.channels.table import default_table
+
+RATE_HZ = 20e3
+TIMES_S = 0.7 + np.arange(3000) / RATE_HZ
+FORCE = 3000.0 + 60.0 * np.sin(2.0 * math.pi * 6.2 * TIMES_S) + 150.0 * np.sin(2.0 * math.pi * 180.0 * TIMES_S) * (
+    TIMES_S > 0.8
+)  # fmt: skip
+"""A preloaded force: unbalance, then vibrations from a hammer pulse on."""
+PROBE = 0.3 * np.cos(2.0 * math.pi * 6.2 * TIMES_S + 0.4) + 0.1 * np.sin(900.0 * (TIMES_S - 0.7) ** 2)
+
+
+def show(name: str, expected: np.ndarray, values: np.ndarray, noise: float, seed: int = 1, **told: float) -> Shown:
+    channel = default_table().channels[name].model_copy(update={"highpass_hz": 0.0, **told})
+    values = values + noise * np.random.default_rng(seed).standard_normal(len(values))
+    others = {
+        default_table().channels[one]: (TIMES_S, signal)
+        for one, signal in (("P_N", FORCE), ("disk_y", PROBE)) if one != name
+    }  # fmt: skip
+    return Shown(
+        channel, TIMES_S, values, expected, np.full(len(values), noise), noise, neighbours=lambda: others
+    )  # fmt: skip
+
+
+def name_single(*shown: Shown) -> Explanation:
+    (found,) = diagnose(list(shown), float(TIMES_S[-1]))
+    return found
+
+
+def high_pass(signal: np.ndarray, hz: float) -> np.ndarray:
+    """Return a signal after a settled first-order high-pass, by the bilinear transform."""
+    from scipy.signal import lfilter
+
+    k = math.pi * hz / RATE_HZ
+    b, a = np.array([1.0, -1.0]) / (1.0 + k), [1.0, -(1.0 - k) / (1.0 + k)]
+    return lfilter(b, a, np.concatenate([np.full(40_000, signal[0]), signal]))[40_000:]
+
+
+def test_an_ac_coupling_has_its_name_and_corner() -> None:
+    found = name_single(show("P_W", FORCE, high_pass(FORCE, 5.0), 1.0))
+    assert (found.name, found.unit, found.sure) == ("P_W AC coupling", "Hz", True)
+    assert found.value == pytest.approx(5.0, rel=0.01)
+    told = high_pass(FORCE, 0.5)
+    found = name_single(show("P_W", told, high_pass(FORCE, 2.0), 1.0, highpass_hz=0.5))
+    assert found.value == pytest.approx(2.0, rel=0.02)
+    assert found.change.endswith("Hz, told 0.5 Hz")
+
+
+@pytest.mark.parametrize(("size", "name"), [(2e-5, "offset"), (0.01, "offset and hum"), (0.2, "hum and offset")])
+def test_a_law_that_needs_a_level_states_it(size: float, name: str) -> None:
+    hum = size * np.sin(2.0 * math.pi * 50.0 * TIMES_S)
+    found = name_single(show("disk_x", PROBE, PROBE + 0.05 + hum, 5e-4))
+    assert found.name == f"disk_x {name}"
+    assert "+0.05" in found.change
+    assert ("Hz" in found.change) == (name != "offset")
+
+
+def test_a_level_is_no_crosstalk() -> None:
+    found = name_single(show("P_W", FORCE, FORCE - 3000.0 + 4.0 * PROBE, 1.0))
+    assert found.name == "P_W offset and crosstalk"
+    found = name_single(show("P_W", FORCE, FORCE + 40.0 * PROBE, 1.0))
+    assert found.name == "P_W crosstalk"
+    other = 30.0 * np.sin(4000.0 * (TIMES_S - 0.7) ** 2)
+    found = name_single(show("P_W", FORCE, FORCE - 3000.0 + 30.0 * PROBE + other, 1.0))
+    assert found.name == "P_W offset"
+
+
+def test_a_gain_for_a_part_of_the_time_is_one_with_its_times() -> None:
+    for_4_ms = (TIMES_S > 0.81) & (TIMES_S < 0.814)
+    found = name_single(show("P_W", FORCE, np.where(for_4_ms, 0.3, 1.0) * FORCE, 1.0))
+    assert (found.name, found.sure) == ("P_W gain", True)
+    assert found.value == pytest.approx(-0.7, abs=0.01)
+    assert found.change.startswith("-70 % from 0.81")
+
+
+def test_values_that_wrap_around_are_not_clipped_nor_nonlinear() -> None:
+    signal = 40.0 * np.sin(2.0 * math.pi * 180.0 * TIMES_S) * (TIMES_S > 0.75)
+    whole = show("inner_x", signal, signal, 0.1)
+    found = name_single(replace(whole, values=(whole.values + 30.0) % 60.0 - 30.0))
+    assert found.name == "inner_x wrap"
+    assert found.value == pytest.approx(60.0, rel=1e-3)
+
+
+def test_a_clipped_channel_is_not_nonlinear() -> None:
+    signal = 40.0 * np.sin(2.0 * math.pi * 180.0 * TIMES_S) * (TIMES_S > 0.75)
+    clipped = show("inner_x", signal, signal, 0.1)
+    found = name_single(replace(clipped, values=np.clip(clipped.values, -30.0, 30.0)))
+    assert (found.name, found.change) == ("inner_x clip", "at -30 m/s^2 and 30 m/s^2")
+
+
+def test_uneven_extra_pulses_are_not_missing_ones() -> None:
+    edges = np.arange(20) / 6.25
+    later = edges[8:] + 0.3 / 6.25
+    faults = edge_faults(np.sort(np.r_[edges, later]), 0.5, 6.25)
+    assert not [one for one in faults if one.what == "miss-pulses"]
+
+
+@pytest.mark.parametrize("left", [1.5, 7.7])
+def test_a_defect_that_leaves_more_than_noise_is_only_the_closest(left: float) -> None:
+    one = Explanation("sensor", "inner_x offset", "+2 m/s^2", 2.0, "m/s^2", 0.97, left, 1e4 * left**2, 10_000, 0.3)
+    conclusion, names = conclude([one], [one], load_criteria().attribution, end_s=0.3)
+    assert ("closest is sensor: inner_x offset" in conclusion) == (left > 2.0)
+    assert names == (("inner_x offset",) if left < 2.0 else ())
