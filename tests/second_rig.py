@@ -307,3 +307,30 @@ def record_log(
         found[name] = CubicSpline(np.arange(len(smooth)), smooth)(place)
         found[name] += noise * NOISE[name] * rng.standard_normal(n)
     return own_s, found
+
+
+def add_noise(
+    own_s: np.ndarray, values: dict[str, np.ndarray], *, slope: float, level: float, lines: int, seed: int
+) -> dict[str, np.ndarray]:
+    """Return a log with the noise of a real measuring chain in addition to white noise, except on the keyphasor.
+
+    Args:
+        own_s: Times [s].
+        values: By channel.
+        slope: Of the density of the noise, (100 Hz / f)^slope; 0: white.
+        level: Of that noise at 100 Hz, over the white noise.
+        lines: Number of odd harmonics of 50 Hz, each with an RMS of 0.4 of the white noise.
+        seed: Of the noise.
+    """
+    rng, n = np.random.default_rng([seed, 1]), len(own_s)
+    f = np.fft.rfftfreq(n, own_s[1] - own_s[0])
+    f[0] = f[1]
+    noisy = dict(values)
+    for name in values.keys() - {"keyphasor"}:
+        lines_of_noise = rng.standard_normal(len(f)) + 1j * rng.standard_normal(len(f))
+        more = level * np.fft.irfft(lines_of_noise * (100.0 / f) ** (0.5 * slope), n) * math.sqrt(n / 2.0)
+        for k in range(lines):
+            turn = 2.0 * math.pi * (50.0 * (2 * k + 1) * own_s + rng.random())
+            more += 0.4 * math.sqrt(2.0) * np.sin(turn)
+        noisy[name] = values[name] + NOISE[name] * more
+    return noisy

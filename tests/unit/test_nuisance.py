@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from replays.recordings.validation.explanations.channel_fit import Shown
 from replays.recordings.validation.explanations.signals import edge_faults
 from replays.recordings.validation.explanations.timing import filtered
 from rig.base.errors import InputError
+from rig.base.outcome import Outcome
 from rig.channels.table import default_table
 from rig.run.offline import simulate
 from rig.run.scenes import load_scene
@@ -127,10 +129,50 @@ def import_all_channels(
     return import_log(folder, {"time": own_s, **values}, WHOLE)
 
 
-@pytest.mark.parametrize("kind", ["sinc", *(pytest.param(kind, marks=MATRIX) for kind in LOW_PASSES if kind != "sinc")])
-def test_an_aligned_log_behind_any_known_low_pass_is_good(kind: str, motion: second_rig.Motion, tmp_path: Path) -> None:
-    own_s, values = second_rig.record_log(motion, seed=3, ppm=PPM, low_pass=kind)
-    assert validate(import_log(tmp_path, {"time": own_s, **values}, map_low_pass(kind))).good
+def draw_log(folder: Path, seed: int, rig: second_rig.Rig | None = None) -> Recording:
+    """Return a log with drawn angle, force, filter, noise, rate and clock."""
+    rng = np.random.default_rng(7000 + seed)
+    turned, force_n, ppm = rng.uniform(0.0, 6.28), rng.uniform(80.0, 120.0), rng.uniform(-200.0, 200.0)
+    rate_hz = 102_400.0 if seed % 10 == 9 else float(rng.choice([10e3, 12.8e3, 20e3, 25.6e3, 51.2e3]))
+    kind, bandwidth_hz = list(LOW_PASSES)[seed % len(LOW_PASSES)], min(5000.0, 0.4 * rate_hz)
+    motion = second_rig.simulate_pulse(
+        rig, turned=turned, force_n=force_n, before_s=0.3, after_s=0.1 if seed == 1 else 0.25, settled_s=2.0
+    )
+    own_s, values = second_rig.record_log(
+        motion, seed=seed, rate_hz=rate_hz, ppm=ppm, low_pass=kind, bandwidth_hz=bandwidth_hz
+    )
+    values = second_rig.add_noise(
+        own_s, values, slope=rng.choice([0.0, 0.5, 1.0, 1.5, 2.0]), level=rng.uniform(0.1, 0.9),
+        lines=int(rng.integers(0, 4)), seed=seed,
+    )  # fmt: skip
+    mapping = map_low_pass(kind).replace("bandwidth_hz = 5000", f"bandwidth_hz = {bandwidth_hz:g}")
+    return import_log(folder, {"time": own_s, **values}, mapping)
+
+
+def draw_wrong_contact(seed: int) -> second_rig.Rig:
+    """Return a rig whose contacts differ from the model."""
+    rng, right = np.random.default_rng(8000 + seed), second_rig.Rig()
+    sign = rng.choice([-1.0, 1.0])
+    changes: list[dict[str, Any]] = [
+        {"late": True},
+        {"exponent": 1.5 + sign * rng.uniform(0.01, 0.06)},
+        {"c": right.c * (1.0 + 0.3 * sign)},
+        {"mu": right.mu * (1.0 + sign * rng.uniform(0.005, 0.1))},
+        {"K": right.K * (1.0 + sign * rng.uniform(0.02, 0.1))},
+    ]
+    return right._replace(**changes[seed % 5])
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=MATRIX) for seed in range(60) if seed != 1)])
+def test_an_aligned_log_of_any_filter_noise_rate_and_clock_is_good(seed: int, tmp_path: Path) -> None:
+    found = validate(draw_log(tmp_path, seed))
+    assert found.good, found.verdict_line
+
+
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=MATRIX) for seed in range(60)])
+def test_a_log_of_another_contact_is_not_good(seed: int, tmp_path: Path) -> None:
+    found = validate(draw_log(tmp_path, seed, draw_wrong_contact(seed)))
+    assert found.outcome is not Outcome.PASS, found.verdict_line
 
 
 @pytest.mark.parametrize("kind", ["bessel", "sinc"])

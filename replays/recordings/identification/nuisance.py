@@ -80,8 +80,10 @@ _MARGIN_S = 2e-3
 _FULL_RATE_S, _DECIMATION = 0.03, 8
 """Time before the hammer pulse from which samples are kept [s], and the decimation factor of earlier ones, which only
 determine the state of the shaft."""
-_WINDOWS_S = (4e-3, 8e-3, 13e-3, 18e-3, 24e-3, 30e-3)
+_WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """Lengths of the fit windows from the start of the hammer pulse [s]."""
+_MIN_GROWTH_S = 1.6e-3
+"""Growth of the window up to which it is halved if residuals grow [s]."""
 _COUNTED_GROWTHS = 2
 """Last growths of the window whose changes of the values represent the error of the model."""
 _SEARCH_S = 5e-3
@@ -502,8 +504,10 @@ def _fit_windows(
     values = np.array([get_value(baseline, key) for key in wanted])
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
     jackknife, rows = np.zeros(len(values)), list[int]()
-    for n, length in enumerate(_WINDOWS_S, 1):
-        progress(f"{len(wanted)} values, window {n} of {len(_WINDOWS_S)}, to {first_s + length:.3f} s")
+    lengths, last_s = list(_WINDOWS_S), 0.0
+    while lengths:
+        length = lengths.pop(0)
+        progress(f"{len(wanted)} values, to {first_s + length:.4f} s of {first_s + _WINDOWS_S[-1]:.3f} s")
         parts = {name: part.select_until(first_s + length) for name, part in whole.items()}
         predictor = Predictor(baseline, tuple(wanted), parts)
         # Without a prior, a value is held so weakly that only one without any effect keeps its start.
@@ -522,13 +526,17 @@ def _fit_windows(
             place for place, key in enumerate(wanted)
             if key not in NUISANCES and covariance[place, place] > 0.25 * priors[1, place] ** 2
         ]  # fmt: skip
+        worse = any(b > _MAX_RMS_GROWTH * a for a, b in zip(scales, now, strict=False))
+        if worse and not unseen and length - last_s > _MIN_GROWTH_S:
+            lengths = [0.5 * (last_s + length), length, *lengths]  # the step was too long for a linear model
+            continue
         if scales and unseen and _is_worse(now, scales):
             fit, here, now = fitted(search_restarts(predictor, values, unseen, every))
         # Sharp signals of a contact that the model does not explain must not bend the motion before it.
         early = [max(1.0, rms(z[:n])) for z, n in zip(here.apart, rows, strict=False)]
         if _is_worse(now, scales) or any(b > _MAX_RMS_GROWTH * a for a, b in zip(scales, early, strict=False)):
             break  # the model does not explain the longer window, which is for the judgement to report
-        scales, rows = now, [len(z) for z in here.apart]
+        scales, rows, last_s = now, [len(z) for z in here.apart], length
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
         moves.append(fit - values)
         covariance, values = np.linalg.inv(square + np.diag(priors[1] ** -2.0)), fit
