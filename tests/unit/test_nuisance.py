@@ -75,6 +75,7 @@ source = "keyphasor"
 LOW_PASSES = {
     "butterworth": "", "bessel": 'filter = "bessel"\n', "chebyshev": 'filter = "chebyshev"\nripple_db = 0.5\n',
     "butterworth-2": "filter_order = 2\n", "fir": 'filter = "fir"\nfilter_order = 64\n', "sinc": 'filter = "sinc"\n',
+    "fir-compensated": 'filter = "fir"\nfilter_order = 64\ngroup_delay_us = 0\n',
 }  # fmt: skip
 """Lines of a mapping for the low-passes of `second_rig`."""
 
@@ -267,6 +268,21 @@ def test_another_low_pass_in_a_log_is_named_with_kinds_like_it(
     found = validate(import_log(tmp_path, {"time": own_s, **values}, WHOLE))
     assert found.explained is not None
     assert re.search(rf"inner_x bandwidth low-pass of kind .*{kind} \d", found.explained.conclusion)
+
+
+@MATRIX
+@pytest.mark.parametrize(("kind", "corner_hz"), [("butterworth", 2500.0), ("butterworth", 3000.0), ("bessel", 5000.0)])
+def test_another_low_pass_of_all_sensors_is_one_cause(
+    kind: str, corner_hz: float, motion: second_rig.Motion, tmp_path: Path
+) -> None:
+    names = [name for name in second_rig.UNITS if name not in ("speed", "keyphasor", "hammer")]
+    own_s, values = second_rig.record_log(
+        motion, seed=3, ppm=PPM, low_pass=dict.fromkeys(names, kind), bandwidth_hz=dict.fromkeys(names, corner_hz)
+    )
+    found = validate(import_log(tmp_path, {"time": own_s, **values}, WHOLE)).explained
+    assert found is not None
+    assert f"all 12 channels of probes, forces, accelerations behind a low-pass of kind {kind}" in found.conclusion
+    assert [one.value for one in found.ranked] == [pytest.approx(corner_hz, rel=0.04)]
 
 
 def test_a_channel_with_its_own_filter_takes_no_shape_from_the_defaults() -> None:

@@ -63,6 +63,12 @@ def test_a_recordings_own_calibration_is_used(experiment: Experiment) -> None:
     assert delay_s == pytest.approx(2.6131 / (2.0 * np.pi * 200.0), rel=0.03)
 
 
+def test_a_compensated_filter_shows_in_its_last_rows_what_comes_after_them(experiment: Experiment) -> None:
+    linear = {"filter": "fir", "filter_order": 64, "group_delay_us": 0.0}
+    in_pulse, whole = (shown(experiment, "hammer", "P_E", end_s=end_s, **linear) for end_s in (0.022, 0.04))
+    assert np.abs(whole[: len(in_pulse)] - in_pulse).max() < 1e-3
+
+
 @pytest.mark.parametrize("sent", [(), (SentCommand(30_500, "speed", {"speed_hz": 5.0}),)])
 def test_a_late_start_is_the_same_as_from_the_start(sent: tuple[SentCommand, ...]) -> None:
     """Far from the start the channels are computed from shortly before the requested rows."""

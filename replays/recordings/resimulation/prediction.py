@@ -96,6 +96,11 @@ class Measured:
         corners = ((channel, channel.bandwidth_hz * factor) for channel in self.channels)
         return replace(self, channels=tuple(one.model_copy(update={"bandwidth_hz": hz}) for one, hz in corners))
 
+    def with_low_pass(self, names: Sequence[str], low_pass: Mapping[str, Any]) -> Measured:
+        """Return the rows with other numbers of the low-pass of some channels."""
+        channels = (one.model_copy(update=low_pass if one.name in names else {}) for one in self.channels)
+        return replace(self, channels=tuple(channels))
+
     def select_first(self, n: int) -> Measured:
         """Return the first rows."""
         return self.select_rows(slice(n))
@@ -303,6 +308,12 @@ def lead_s(channel: Channel) -> float:
     return max(0.0, channel.half_length_s - delay_s(channel))
 
 
+def last_needed_s(parts: Mapping[str, Measured]) -> float:
+    """Return the time up to which samples need the motion: the last one, and the lead of a compensated filter [s]."""
+    last_s = max((float(part.times_s[-1]) for part in parts.values()), default=0.0)
+    return last_s + max((lead_s(channel) for part in parts.values() for channel in part.channels), default=0.0)
+
+
 def interpolate_rows(values: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Interpolate even samples by the polynomial through the six nearest ones; sampling points are reproduced.
 
@@ -410,8 +421,7 @@ def predict(
     if end_s is not None:
         parts = {name: part.select_until(end_s) for name, part in parts.items()}
     parts = {name: part for name, part in parts.items() if len(part.times_s)}
-    last_s = max((float(part.times_s[-1]) for part in parts.values()), default=0.0)
-    last_s += max((lead_s(channel) for part in parts.values() for channel in part.channels), default=0.0)
+    last_s = last_needed_s(parts)
     simulation = experiment.simulation()
     if experiment.scene.generator is not None:
         if follow is not None:

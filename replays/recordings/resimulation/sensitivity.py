@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import LeadIns, Measured, Prediction, predict, simplify
+from replays.recordings.resimulation.prediction import LeadIns, Measured, Prediction, last_needed_s, predict, simplify
 from rig.base.errors import InputError, SimulationError
 from rig.channels.sampling import ROW_TICKS
 from rig.physics.model import build_model
@@ -203,7 +203,7 @@ class Predictor:
         self.runs = 0
         first_s = min(float(part.times_s[0]) for part in self.parts.values())
         self._about_s = first_s if about_s is None else about_s
-        self._last_s = max(float(part.times_s[-1]) for part in self.parts.values())
+        self._last_s = last_needed_s(self.parts)
         self._experiment = simplify(experiment)
         self._cache: dict[tuple[float, ...], Prediction] = {}
         self._lead_ins = LeadIns()
@@ -272,7 +272,7 @@ class Predictor:
         return direction
 
     def _is_later(self, key: str) -> bool:
-        """Return whether a command comes after the last row, without effect on the samples."""
+        """Return whether a command comes after all that the last row shows, without effect on the samples."""
         kind, number, _ = key.split(".")
         return get_value(self._experiment, f"{kind}.{number}.at_s") > self._last_s + _MARGIN_S
 
@@ -305,9 +305,8 @@ class Predictor:
     def _run(self, values: dict[str, float]) -> Prediction:
         self.runs += 1
         parts = to_model_clock(self.parts, values, about_s=self._about_s)
-        last_s = max(float(part.times_s[-1]) for part in parts.values())
         # Contacts after the window do not count.
-        end_s = math.ceil(round((last_s + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
+        end_s = math.ceil(round((last_needed_s(parts) + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
         changed = with_values(self._experiment, {**values, "duration_s": end_s})
         if late := self._find_lateness(values):
             parts = {name: replace(part, times_s=part.times_s - late(part.times_s)) for name, part in parts.items()}
