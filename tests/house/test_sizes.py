@@ -38,7 +38,7 @@ BUDGETS = {
     "replays/estimate": 541,
     "replays/player": 816,
     "replays/plots": 1710,
-    "replays/recordings": 12259,
+    "replays/recordings": 12260,
     "replays/report": 531,
     "replays/score": 4253,
     "replays/sessions": 77,

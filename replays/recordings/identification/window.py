@@ -33,8 +33,9 @@ class Window:
         self._start = np.array([unknown.start for unknown in question.unknowns])
         self._scale = np.array([unknown.scale for unknown in question.unknowns])
         parts = self._predictor.parts
-        whole = {name: part.values for name, part in parts.items()}
-        self._measured = self._over_noise(whole)
+        self._measured = observation.values[: self.rows] / observation.noise
+        if any(part.spectra for part in parts.values()):
+            self._measured = self._over_noise({name: part.values for name, part in parts.items()})
         self.valid = np.isfinite(self._measured)
 
     @property
