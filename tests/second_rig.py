@@ -276,7 +276,7 @@ def record_log(
     seed: int,
     rate_hz: float = 20_000.0,
     ppm: float = 80.0,
-    bandwidth_hz: float | dict[str, float] = 5000.0,
+    bandwidth_hz: float = 5000.0,
     low_pass: str | dict[str, str] = "butterworth",
     noise: float = 1.0,
     edit: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = lambda values: values,
@@ -288,7 +288,7 @@ def record_log(
         seed: Of the noise.
         rate_hz: Sample rate by the recorder's own clock [Hz].
         ppm: Error of that clock [ppm]; positive: fast.
-        bandwidth_hz: Of the low-pass before the converter, or by channel, for others 5 kHz; the speed's is 200 Hz.
+        bandwidth_hz: Of the low-pass before the converter; the speed's is 200 Hz.
         low_pass: Its kind, or kinds by channel; others and the speed have a fourth-order Butterworth.
         noise: Factor of the sensors' noise.
         edit: Changes the signals before the filter: faults of sensors.
@@ -302,8 +302,7 @@ def record_log(
     found = {}
     for name, values in edit(motion.values).items():
         kind = low_pass if isinstance(low_pass, str) else low_pass.get(name, "butterworth")
-        corner_hz = bandwidth_hz.get(name, 5000.0) if isinstance(bandwidth_hz, dict) else bandwidth_hz
-        slow = ("butterworth", 200.0) if name == "speed" else (kind, corner_hz)
+        slow = ("butterworth", 200.0) if name == "speed" else (kind, bandwidth_hz)
         smooth = apply_low_pass(slow[0], values, motion.rate_hz, slow[1])
         found[name] = CubicSpline(np.arange(len(smooth)), smooth)(place)
         found[name] += noise * NOISE[name] * rng.standard_normal(n)

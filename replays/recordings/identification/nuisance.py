@@ -163,7 +163,7 @@ class Tuned:
         longest_s: End of the samples if the model had explained all of them [s].
         scales: Residual rms over noise of each channel, at least 1.
         spectra: Spectrum of the noise of each channel that is not white, by name.
-        whole: Samples of all windows.
+        parts: Samples of the fit.
     """
 
     baseline: Experiment
@@ -177,12 +177,7 @@ class Tuned:
     longest_s: float
     scales: dict[str, float]
     spectra: dict[str, NoiseSpectrum]
-    whole: dict[str, Measured] = field(repr=False)
-
-    @property
-    def parts(self) -> dict[str, Measured]:
-        """Samples of the fit."""
-        return {name: part.select_until(self.end_s) for name, part in self.whole.items()}
+    parts: dict[str, Measured] = field(repr=False)
 
     def to_model_clock(self, parts: dict[str, Measured]) -> dict[str, Measured]:
         """Return channels of the log on the model's clock."""
@@ -390,7 +385,7 @@ def tune(
         longest_s=end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), fit.scales, strict=True)),
         spectra={name: one for part in whole.values() for name, one in part.named_spectra if one is not None},
-        whole=whole,
+        parts={name: part.select_until(fit.end_s) for name, part in whole.items()},
     )
 
 

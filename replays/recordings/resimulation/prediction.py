@@ -96,11 +96,6 @@ class Measured:
         corners = ((channel, channel.bandwidth_hz * factor) for channel in self.channels)
         return replace(self, channels=tuple(one.model_copy(update={"bandwidth_hz": hz}) for one, hz in corners))
 
-    def with_low_pass(self, names: Sequence[str], low_pass: Mapping[str, Any]) -> Measured:
-        """Return the rows with other numbers of the low-pass of some channels."""
-        channels = (one.model_copy(update=low_pass if one.name in names else {}) for one in self.channels)
-        return replace(self, channels=tuple(channels))
-
     def select_first(self, n: int) -> Measured:
         """Return the first rows."""
         return self.select_rows(slice(n))

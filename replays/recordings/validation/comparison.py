@@ -30,7 +30,6 @@ from replays.recordings.validation.explanations.attribution import (
 from replays.recordings.validation.explanations.budget import Budget, make_fit_budgets, make_quantity_budgets
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import find_common_delay, select_channels
-from replays.recordings.validation.explanations.low_pass import explain_by_group_low_pass
 from replays.recordings.validation.explanations.model_parameters import find_changes
 from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, is_quiet, signal_faults
 from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
@@ -87,7 +86,8 @@ def validate(
         experiment = experiment.with_changes(changes)
     _check_request(recording, experiment, criteria, budget=budget)
     recording = recording.without_faults() if blind else recording.with_true_blocks()
-    experiment = experiment.without_faults() if blind else experiment
+    if blind:
+        experiment = experiment.without_faults()
     again = _resimulate(recording, experiment, criteria, step)
     begin, end, reason = _window(again)
     trajectory, tolerated = again.judge_trajectory(end)
@@ -138,8 +138,6 @@ def validate(
             next(one.from_s for one in phases if one.name in CONTACT), "the shaft touches the ring from there on, but "
             "the known experiment causes no contact: a hammer pulse may be missing from the mapping ([[commands]])",
         ))  # fmt: skip
-    if (group := _explain_group(again, trajectory, touched, step)) is not None:
-        return replace(validation, explained=group)
     if not firsts and again.tuned is not None and not again.faults:
         text = "up to there all channels agree; the later difference is due to contact (`rig identify --fit "
         text += "contact.friction,contact.restitution`), ring or housing, or to a sensor that changes there"
@@ -150,12 +148,13 @@ def validate(
     again = again.select_causes(min(firsts), touched)
     step("what explains the difference")
     if again.tuned is None:
+        rules = again.criteria.attribution
         return replace(validation, explained=attribute(
-            again.quick, again.parts, again.nominal, again.criteria.attribution, from_s=min(firsts), own=again.own,
-            step=step,
+            again.quick, again.parts, again.nominal, rules, from_s=min(firsts), own=again.own, step=step
         ))  # fmt: skip
     explained = _explain_log(again, from_s=min(firsts), end_s=end, touching=touching)
-    if late_s := find_common_delay(explained.ranked, again.parts):
+    late_s = find_common_delay(explained.ranked, again.parts)
+    if late_s:
         step("the same with channels of a kind late together")
         other = _resimulate_log(recording, experiment, criteria, step, late_s=late_s)
         if other.tuned is not None and other.tuned.is_better_than(again.tuned):
@@ -417,17 +416,6 @@ def _explain_log(again: _Resimulation, *, from_s: float, end_s: float, touching:
         again.parts, again.nominal, again.others, again.tuned, again.criteria.attribution, from_s=from_s, end_s=end_s,
         faults=again.faults, touching=touching,
     )  # fmt: skip
-
-
-def _explain_group(
-    again: _Resimulation, trajectory: Sequence[ChannelResidual], touched_s: float, step: Callable[[str], None]
-) -> Explained | None:
-    """Return the explanation by another low-pass of a group of channels; None if there is none."""
-    if again.tuned is None or touched_s == math.inf or again.faults:
-        return None
-    step("the same with other low-passes of a group of channels")
-    failed = [one.channel for one in trajectory if one.good is False]
-    return explain_by_group_low_pass(again.tuned, failed, touched_s)
 
 
 def find_assumed_corners(recording: Recording) -> dict[str, float]:

@@ -207,7 +207,9 @@ def explain_log(
     sensors = [one for one in sensors if one.explained > _MIN_SHARE * most]
     trigger = any(one.name == "hammer delay" for one in sensors)
     far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
-    cured = are_cause(sensors, parts)
+    # So many different faults at once are rather one of the model.
+    few = len(sensors) < FEW_CHANNELS * len(tuned.scales)
+    cured = few and are_cause(sensors, parts)
     numbers = explain_by_parameters(parts, nominal, others, tuned, rules, end_s=end_s) if sensors or far else []
     # A number that explains no more than the sensors do is not reported with them.
     numbers = [one for one in numbers if one.at_floor or one.explained > MIN_PART]
@@ -238,11 +240,11 @@ def explain_log(
         else:
             conclusion = "recording and model disagree from the hammer pulse onwards: its time, several channels, or "
             conclusion += "the model is wrong; this log does not distinguish them"
-    elif not best and (part := sum(one.explained for one in sensors)) > rules.enough:
+    elif not best and few and (part := sum(one.explained for one in sensors)) > rules.enough:
         conclusion = f"closest are {_list(sensors)}: {part:.0%} of the difference; "
         conclusion += "the rest is another fault, or the model"
-    elif not best and 0 < len(few := select_channels(sensors, tuned.scales)) < FEW_CHANNELS * len(tuned.scales):
-        conclusion = f"of {len(tuned.scales)} channels {_join(few)} alone: an unknown fault, "
+    elif not best and 0 < len(some := select_channels(sensors, tuned.scales)) < FEW_CHANNELS * len(tuned.scales):
+        conclusion = f"of {len(tuned.scales)} channels {_join(some)} alone: an unknown fault, "
         conclusion += "or a number of the model that affects no other; this log does not distinguish them"
     elif not best and small:
         conclusion = f"a change of {_list(small[:_MAX_NAMED])} would explain it, which no calibration knows: "

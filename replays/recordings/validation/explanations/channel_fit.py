@@ -233,11 +233,11 @@ def rms_of(residual: np.ndarray) -> float:
     return math.sqrt(float(residual @ residual) / max(1, len(residual)))
 
 
-def least_at(cost: Callable[[float], float], low: float, high: float, *, most: int = 500) -> float:
-    """Return the place of the least cost between two ends, from at most so many evaluations."""
+def least_at(cost: Callable[[float], float], low: float, high: float) -> float:
+    """Return the place of the least cost between two ends."""
     from scipy.optimize import minimize_scalar
 
-    minimum: Any = minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 1e-9, "maxiter": most})
+    minimum: Any = minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 1e-9})
     return float(minimum.x)
 
 

@@ -45,7 +45,7 @@ _MAX_QUALITY = 1000.0
 """Quality factor that no transducer reaches."""
 _MAX_RATIO, _MIN_PASS = 0.97, 0.1
 """For a log: largest residual of a low-pass relative to that of a delay, and smallest passed part of the signal."""
-KINDS: dict[str, dict[str, Any]] = {
+_KINDS: dict[str, dict[str, Any]] = {
     name: {"filter": name.split()[0], "filter_order": order, "group_delay_us": late_us}
     for name, order, late_us in (
         ("butterworth 4", 4, None), ("butterworth 2", 2, None), ("bessel 4", 4, None), ("chebyshev 4", 4, None),
@@ -212,8 +212,8 @@ def filtered(one: Shown) -> Iterator[Law]:
         delayed = (one.values - delayed_by(one)[1]) / one.floor
         passed = float((one.values - residual * one.floor).std())
         most_hz = min(_MAX_CORNER_RATIO * channel.bandwidth_hz, 0.5 / one.period_s)
-        corners = {kind: find_corner(shape, most_hz) for kind, shape in KINDS.items()}
-        fits = {kind: residual_by(through(hz, KINDS[kind])) for kind, hz in corners.items()}
+        corners = {kind: find_corner(shape, most_hz) for kind, shape in _KINDS.items()}
+        fits = {kind: residual_by(through(hz, _KINDS[kind])) for kind, hz in corners.items()}
         squares = {kind: float(fit @ fit) for kind, fit in fits.items()}
         best = min(squares, key=lambda kind: squares[kind])
         told = float(residual @ residual)

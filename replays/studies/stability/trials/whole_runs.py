@@ -63,7 +63,7 @@ def _is_poisoned(engine: str) -> bool:
 
 
 def collect_warnings(scene: Scene, ticks: int) -> list[str]:
-    """Return the warnings of a run at its end, or the error that ended it."""
+    """Return the warnings and remarks of a run at its end, or the error that ended it."""
     simulation = Simulation(scene)
     try:
         # In blocks of 1 ms, so that a value that is not finite ends the run at once.
@@ -72,7 +72,8 @@ def collect_warnings(scene: Scene, ticks: int) -> list[str]:
                 simulation.advance(1000)
     except SimulationError as error:
         return [str(error)]
-    return simulation.health()["warnings"]
+    health = simulation.health()
+    return health["warnings"] + health["remarks"]
 
 
 def _is_silent(warnings: list[str], *words: str) -> float:
