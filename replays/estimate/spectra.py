@@ -164,11 +164,18 @@ class NoiseSpectrum:
         density[0] *= _EXTRAPOLATED
         return cls(np.concatenate([density, density[-2:0:-1]]))
 
+    @cached_property
+    def _folded(self) -> dict[int, NoiseSpectrum]:
+        """Spectra of every n-th sample, by n; each computes its filter once."""
+        return {1: self}
+
     def fold(self, every: int) -> NoiseSpectrum:
         """Return the spectrum of every n-th sample."""
-        size = len(self.density) // every * every
-        places = np.arange(size) * len(self.density) // size
-        return NoiseSpectrum(self.density[places].reshape(every, -1).mean(axis=0)) if every > 1 else self
+        if every not in self._folded:
+            size = len(self.density) // every * every
+            places = np.arange(size) * len(self.density) // size
+            self._folded[every] = NoiseSpectrum(self.density[places].reshape(every, -1).mean(axis=0))
+        return self._folded[every]
 
     @property
     def low(self) -> float:

@@ -292,7 +292,7 @@ class Simulation:
     def health(self) -> dict[str, Any]:
         """Return spin, energy ledger, warnings and remarks at the current tick, for the status.
 
-        Warnings are reasons to doubt the run; remarks tell what the model met, as the contact law at zero force.
+        Warnings are reasons to doubt the run; remarks report states of the model, such as a contact law held at 0.
         """
         if self.scene.generator is not None:
             return calibrator.health(self.scene)

@@ -393,6 +393,8 @@ def _with_spectra(
     recording: Recording, experiment: Experiment, parts: dict[str, Measured], *, end_s: float
 ) -> dict[str, Measured]:
     """Return parts with the spectra of their noise, from all samples of a log before an end [s]."""
+    if not experiment.imported:
+        return parts  # the noise of the rig itself is white
     every = read_measured(recording, experiment.scene)
     quiet = {
         name: replace(every[name].select_channels(part.names), floor=part.floor, random=part.random)
@@ -400,7 +402,7 @@ def _with_spectra(
         .select_until(end_s)
         for name, part in parts.items()
     }
-    if not experiment.imported or not all(len(part.times_s) for part in quiet.values()):
+    if not all(len(part.times_s) for part in quiet.values()):
         return parts
     quiet = with_spectra(quiet, Predictor(experiment, (), quiet).predict(()).values)
     return {name: replace(part, spectra=quiet[name].spectra) for name, part in parts.items()}

@@ -11,8 +11,6 @@ from replays.estimate.least_squares import solve
 from replays.estimate.spectra import NoiseSpectrum
 from replays.recordings.resimulation.prediction import Measured
 
-_TURNS = 2
-"""Multiples of the speed at which a signal is not noise: a wrong gain and run-out."""
 _MAX_EXCESS = 5.0
 """Largest RMS of coloured noise over white noise; more is a fault."""
 _MAX_LINE = 3.0
@@ -29,26 +27,24 @@ def with_spectra(parts: Mapping[str, Measured], expected: Mapping[str, np.ndarra
         parts: Channels in the quiet stretch, at their full rate.
         expected: Their expected signals, each shape (n, channels).
     """
-    return {
-        name: replace(part, spectra=tuple(_measure(part, c, expected[name]) for c in range(len(part.channels))))
-        for name, part in parts.items()
-    }
+    measured = {}
+    for name, part in parts.items():
+        model = expected[name]
+        scales = np.ptp(model, axis=0)
+        moving = (model - model.mean(axis=0))[:, scales > 0.0] / scales[scales > 0.0]
+        trend = np.linspace(-1.0, 1.0, len(model))
+        table = np.column_stack([np.ones(len(model)), trend, moving, np.gradient(moving, axis=0)])
+        apart = (part.values - model) / part.floor
+        rest = apart - table @ solve(table, apart)
+        measured[name] = replace(part, spectra=tuple(_measure(part, c, rest[:, c]) for c in range(len(part.channels))))
+    return measured
 
 
-def _measure(part: Measured, c: int, expected: np.ndarray) -> NoiseSpectrum | None:
+def _measure(part: Measured, c: int, noise: np.ndarray) -> NoiseSpectrum | None:
+    """Return the spectrum of a channel's noise over its floor, shape (n,); None if white, unknown or a fault."""
     if part.channels[c].name == "keyphasor" or not part.random[c]:
         return None
-    scales = np.ptp(expected, axis=0)
-    moving = (expected - expected.mean(axis=0))[:, scales > 0.0] / scales[scales > 0.0]
-    columns = [np.ones(len(expected)), np.linspace(-1.0, 1.0, len(expected)), *moving.T, *np.gradient(moving, axis=0).T]
-    rest = solve_rest(columns, (part.values[:, c] - expected[:, c]) / part.floor[c])
-    spectrum = NoiseSpectrum.estimate(rest)
+    spectrum = NoiseSpectrum.estimate(noise)
     if spectrum is None or spectrum.excess > _MAX_EXCESS or spectrum.largest_line > _MAX_LINE:
         return None
     return spectrum
-
-
-def solve_rest(columns: list[np.ndarray], values: np.ndarray) -> np.ndarray:
-    """Return values without their least-squares combination of columns, shape (n,)."""
-    table = np.column_stack(columns)
-    return values - table @ solve(table, values)

@@ -207,7 +207,7 @@ def explain_log(
     sensors = [one for one in sensors if one.explained > _MIN_SHARE * most]
     trigger = any(one.name == "hammer delay" for one in sensors)
     far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
-    # So many different faults at once are rather one of the model.
+    # Different faults of more channels than `FEW_CHANNELS` are rather one error of the model.
     few = len(sensors) < FEW_CHANNELS * len(tuned.scales)
     cured = few and are_cause(sensors, parts)
     numbers = explain_by_parameters(parts, nominal, others, tuned, rules, end_s=end_s) if sensors or far else []
@@ -230,7 +230,7 @@ def explain_log(
         best = (*(one.key for one in far), *best)
         conclusion = "outside the known uncertainty: " + "; ".join(one.line for one in far) + also
     elif not best and cured and "closest is sensor" in conclusion:
-        pass  # the defect of a channel, of which the rest is more than noise
+        pass  # the closest defect of a channel is stated, although more than noise is left
     elif not best and faults:
         conclusion = f"first repair the faults of signals: {'; '.join(one.line for one in faults)}"
     elif not best and float(np.median(list(tuned.scales.values()))) > _MAX_MEDIAN_RESIDUAL:
