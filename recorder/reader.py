@@ -73,6 +73,8 @@ class Recording(Plottable):
         """True if the effects of faults on blocks are reversed; see `with_true_blocks`."""
         self.applies_faults = True
         """True if the fault documents are applied; see `without_faults`."""
+        self.correction: tuple[str, Callable[[Samples], None]] | tuple[None, None] = None, None
+        """Description of a correction, and the function that changes samples; see `with_correction`."""
 
     @classmethod
     def open(cls, path: Path | str, *, salvage: bool = False) -> Self:
@@ -246,6 +248,8 @@ class Recording(Plottable):
         values = samples.values  # convert in place: may be gigabytes
         values *= np.array([channel.scale for channel in group.channels])
         values += np.array([channel.offset for channel in group.channels])
+        if self.correction[1] is not None:
+            self.correction[1](samples)
         return samples
 
     def truth(self, table: str) -> Samples:
@@ -296,6 +300,17 @@ class Recording(Plottable):
                 elif (block := part.block(key, payload)) is not None:
                     yield key, block if declared is None else declared.true(key, block)
 
+    def with_correction(self, text: str, correct: Callable[[Samples], None]) -> Self:
+        """Return the recording with samples that a function corrects in place when they are read.
+
+        Args:
+            text: Description of the correction, for reports.
+            correct: Function that changes the values of one group in engineering units.
+        """
+        recording = copy(self)
+        recording.correction = text, correct
+        return recording
+
     def with_true_blocks(self) -> Self:
         """Return the recording with reported block faults reversed: each block once, in order, at its own time."""
         recording = copy(self)
@@ -312,6 +327,7 @@ class Recording(Plottable):
             return self
         recording = type(self)(tuple(part.between(from_s, to_s) for part in self.parts))
         recording.true, recording.applies_faults, recording.in_part = self.true, self.applies_faults, True
+        recording.correction = self.correction
         return recording
 
     def without_faults(self) -> Self:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from replays.estimate.intervals import format_with_half_width, student_quantile
 from replays.estimate.runs import split_at_breaks
 from rig.base import units
 from rig.base.errors import InputError, UnknownNameError, Words
@@ -39,6 +40,12 @@ Load = Callable[[str, float, float], Samples]
 """Function of a group and the times of its first and last row [s] that returns at least these rows."""
 
 
+_SPAN_ANGLES = 721
+"""Angles of a revolution at which a peak-to-peak value is read."""
+_MIN_SLOW_TURNS = 2
+"""Fewest revolutions of slow roll, so that their scatter shows an uncertainty."""
+_MAX_SLOW_PART = 0.25
+"""Largest speed of slow roll relative to that of the recording, so that at most a sixteenth of its 1X is unbalance."""
 _CACHE_BYTES = 100_000_000
 """Size up to which earlier results of one kind are kept in addition to the latest: all groups of some seconds."""
 
@@ -110,14 +117,22 @@ class Runout:
 
     Attributes:
         vectors: Components by channel: 1X, 2X, ..., relative to the keyphasor, in the channel's unit.
+        halves: Half of the 95 % interval of the waveform by channel, from the scatter of the revolutions.
+        turns: Fewest revolutions of a channel.
     """
 
     vectors: Mapping[str, np.ndarray]
+    halves: Mapping[str, float] = field(default_factory=dict)
+    turns: int = 0
 
     def compute(self, channel: str, angle: np.ndarray) -> np.ndarray:
         """Return the run-out of a channel at angles from the keyphasor's passage [rad], shape (n,)."""
         waves = [np.real(vector * np.exp(1j * k * angle)) for k, vector in enumerate(self.vectors[channel], 1)]
         return np.sum(waves, axis=0)
+
+    def measure_span(self, channel: str) -> float:
+        """Return the peak-to-peak value of the run-out of a channel, in its unit."""
+        return float(np.ptp(self.compute(channel, np.linspace(0.0, 2.0 * math.pi, _SPAN_ANGLES))))
 
 
 def _is_number(value: Any, low: float = -math.inf) -> bool:
@@ -420,7 +435,8 @@ def measure_runout(source: Any, *, orders: int = 1, max_hz: float | None = None,
         raise InputError("orders", "a whole number of at least 1", orders)
     check_options(max_hz=max_hz)
     signals = read_signals(source, **options)
-    edges_s, vectors = signals.require_edges("run-out"), dict[str, np.ndarray]()
+    edges_s, vectors, halves = signals.require_edges("run-out"), dict[str, np.ndarray](), dict[str, float]()
+    counts = list[int]()
     probes = [name for pair in signals.require_pairs().values() for name in pair]
     for name in [name for name in probes if signals.is_length(name)] or probes:
         samples = signals.read(name)
@@ -428,8 +444,60 @@ def measure_runout(source: Any, *, orders: int = 1, max_hz: float | None = None,
         slow = np.diff(edges_s)[turns] >= (0.0 if max_hz is None else 1.0 / max_hz)
         if not slow.any():
             raise InputError("max_hz", f"above the speed of a whole revolution of {name}", max_hz)
-        vectors[name] = fitted[slow, 1:, 0].mean(axis=0)
-    return Runout(vectors)
+        vectors[name], count = fitted[slow, 1:, 0].mean(axis=0), int(slow.sum())
+        spread = math.sqrt(0.5 * float(fitted[slow, 1:, 0].var(axis=0).sum()) / max(1, count - 1))
+        halves[name] = spread * float(student_quantile(0.975, count - 1)) if count > 1 else math.inf
+        counts.append(count)
+    return Runout(vectors, halves, min(counts))
+
+
+def subtract_runout(recording: Any, slow: Any, *, orders: int, from_s: float | None, to_s: float | None) -> Any:
+    """Return a recording whose samples are read without the run-out of a slow roll, by the angle of the shaft.
+
+    Args:
+        recording: The recording.
+        slow: Recording with slow roll, of the same probes.
+        orders: Number of components of the waveform.
+        from_s: Begin of the slow roll [s]; None for the first row.
+        to_s: End of the slow roll [s]; None for the last row.
+
+    Raises:
+        InputError: One of them has no keyphasor, the slow roll is too fast or too short, or the probes differ.
+    """
+    field, edges_s = "--run-out", list[np.ndarray]()
+    for one, span in ((recording, (None, None)), (slow, (from_s, to_s))):
+        edges_s.append(read_signals(one, from_s=span[0], to_s=span[1]).edges_s)
+        if len(edges_s[-1]) < 2:
+            must = "used with recordings that have a keyphasor, and at least two of its passages"
+            raise InputError(field, must, Words(f"{len(edges_s[-1])} in {one.path.name}"))
+    speed_hz = 1.0 / float(np.median(np.diff(edges_s[0])))
+    if len(edges_s[1]) <= _MIN_SLOW_TURNS:
+        must = f"a slow roll of at least {_MIN_SLOW_TURNS} whole revolutions"
+        raise InputError(field, must, Words(f"{len(edges_s[1]) - 1} in {slow.path.name}"))
+    slow_hz = 1.0 / float(np.diff(edges_s[1]).min())
+    if slow_hz > _MAX_SLOW_PART * speed_hz:
+        must = f"a slow roll of at most {_MAX_SLOW_PART * speed_hz:.3g} Hz, a quarter of the recording's speed"
+        raise InputError(field, must, Words(f"{slow_hz:.3g} Hz in {slow.path.name}"))
+    runout = measure_runout(slow, orders=orders, from_s=from_s, to_s=to_s)
+    units_of, slow_units = ({name: one.unit for name, one in each.table.channels.items()} for each in (recording, slow))
+    if not (known := [name for name in runout.vectors if units_of.get(name) == slow_units[name]]):
+        must = "a slow roll of probes of the recording, with the same names and units"
+        raise InputError(field, must, Words(f"{', '.join(runout.vectors)} in {slow.path.name}"))
+
+    def correct(samples: Samples) -> None:
+        angle = 2.0 * math.pi * compute_revolutions(samples.times_s, edges_s[0])
+        for name in set(known).intersection(samples.names):
+            samples.values[:, samples.names.index(name)] -= runout.compute(name, angle)
+
+    spans = [
+        f"{name} {format_with_half_width(runout.measure_span(name), 2.0 * runout.halves[name])} {slow_units[name]}"
+        for name in known
+    ]
+    text = (
+        f"run-out subtracted: {', '.join(spans)} peak to peak, from {runout.turns} revolutions at {slow_hz:.3g} Hz of "
+    )
+    text += f"{slow.path.name}; up to {(slow_hz / speed_hz) ** 2:.1%} of the 1X of unbalance is subtracted with it"
+    return recording.with_correction(text, correct)
 
 
 def read_signals(

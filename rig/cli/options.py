@@ -6,15 +6,17 @@ limit a recording, in s of simulated time. Names are separated by commas; KEY=VA
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 
 if TYPE_CHECKING:
+    from recorder.reader import Recording
     from rig.physics.parameters import ParameterSet
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or path of a scene file")]
@@ -38,10 +40,16 @@ FromS = Annotated[float | None, typer.Option("--from", metavar="S", help="Begin 
 ToS = Annotated[float | None, typer.Option("--to", metavar="S", help="End at this simulated time in s")]
 Channels = Annotated[str | None, typer.Option("--channels", metavar="NAME,...", help="Use only these channels")]
 ChannelFile = Annotated[Path | None, typer.Option("--channels", metavar="FILE.toml", help="Your own channel table")]
+_RUN_OUT_HELP = "Subtract the run-out of this slow roll, between two times in s"
+RunOut = Annotated[str | None, typer.Option("--run-out", metavar="FILE[:T0-T1]", help=_RUN_OUT_HELP)]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files")]
 ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="FILE", help="Write a report with pictures, .html or .pdf")
 ]
+
+
+_RUNOUT_ORDERS = 32
+"""Components of the run-out waveform per revolution: dents of a twentieth of the circumference."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,34 @@ class SceneChanges:
 def split_names(text: str | None) -> list[str]:
     """Return the names of a comma-separated list; empty for None."""
     return [name.strip() for name in (text or "").split(",") if name.strip()]
+
+
+def subtract_run_out(text: str | None, *recordings: Recording, log: bool = False) -> list[Recording]:
+    """Return recordings without the run-out of a slow roll, and print what is subtracted.
+
+    Args:
+        text: Value of `--run-out`; None for none.
+        recordings: The recordings.
+        log: Whether they must be logs, as the model contains the run-out of a recording of this rig.
+
+    Raises:
+        InputError: The slow roll is not one of these probes, or one of them has no keyphasor.
+    """
+    if text is None:
+        return [*recordings]
+    from recorder.reader import join
+    from replays.plots.signals import subtract_runout
+
+    if log and (own := [one for one in recordings if "import" not in one.scene]):
+        raise InputError("--run-out", "used with a log of another system", Words(str(own[0].path)))
+    match = re.fullmatch(r"(.+?)(?::(\d+\.?\d*)-(\d+\.?\d*))?", text)
+    if match is None:
+        raise InputError("--run-out", "a recording, with times such as SLOW.mcap:1.5-9", text)
+    from_s, to_s = (None if time is None else float(time) for time in match.groups()[1:])
+    slow = join([Path(match[1])])
+    corrected = [subtract_runout(one, slow, orders=_RUNOUT_ORDERS, from_s=from_s, to_s=to_s) for one in recordings]
+    typer.echo(corrected[0].correction[0], err=True)
+    return corrected
 
 
 def parse_pairs(option: str, texts: list[str] | None, form: str) -> dict[str, str]:

@@ -116,3 +116,50 @@ def test_a_defect_that_leaves_more_than_noise_is_only_the_closest(left: float) -
     conclusion, names = conclude([one], [one], load_criteria().attribution, end_s=0.3)
     assert ("closest is sensor: inner_x offset" in conclusion) == (left > 2.0)
     assert names == (("inner_x offset",) if left < 2.0 else ())
+
+
+RUNOUT = {1: (4e-3, 0.3), 2: (3e-3, 1.9), 3: (1.5e-3, 4.0), 5: (1e-3, 2.2)}
+"""Amplitudes and phases of a run-out by order [mm, rad]."""
+
+
+def turn_shaft(hz: float) -> np.ndarray:
+    """Return the angle of a shaft that a rub slows down from 0.8 s on [revolutions]."""
+    return hz * (TIMES_S - 0.4 * np.maximum(TIMES_S - 0.8, 0.0) ** 2 / 0.1)
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
+def test_a_run_out_is_periodic_in_the_angle_and_no_hum(size: float) -> None:
+    turns = turn_shaft(20.0)
+    waves = (a * np.cos(2.0 * math.pi * k * turns + phase) for k, (a, phase) in RUNOUT.items())
+    found = name_single(replace(show("disk_x", PROBE, PROBE + size * sum(waves), 4e-4), turns=turns))
+    assert (found.name, found.unit, found.sure) == ("disk_x run-out", "mm", True)
+    assert found.value == pytest.approx(0.0145 * size, rel=0.2)
+    assert "1X 0.0" in found.change
+
+
+@pytest.mark.parametrize("hz", [50.0, 100.0, 20.0 / 3.0])
+def test_a_fixed_frequency_is_hum_also_at_a_multiple_of_the_speed(hz: float) -> None:
+    steady, slowed = 25.0 * TIMES_S, turn_shaft(25.0)
+    hum = show("disk_x", PROBE, PROBE + 0.005 * np.sin(2.0 * math.pi * hz * TIMES_S), 4e-4)
+    for turns in (slowed, *((steady,) if hz > 99.0 else ())):
+        assert name_single(replace(hum, turns=turns)).name == "disk_x hum"
+
+
+def test_a_gain_of_a_probe_is_no_run_out_although_unbalance_is_periodic() -> None:
+    signal = 0.3 * np.cos(2.0 * math.pi * 20.0 * TIMES_S)
+    probe = replace(show("disk_x", signal, 1.03 * signal, 4e-4), turns=20.0 * TIMES_S)
+    assert name_single(probe).name == "disk_x gain"
+
+
+SECOND_PROBE = 0.3 * np.sin(2.0 * math.pi * 6.2 * TIMES_S + 0.4) + 0.05 * np.sin(1300.0 * (TIMES_S - 0.7) ** 2)
+
+
+@pytest.mark.parametrize(("degrees", "words"), [(10.0, "toward"), (-4.0, "away from")])
+def test_a_single_probe_at_another_angle_is_no_crosstalk(degrees: float, words: str) -> None:
+    angle = math.radians(degrees)
+    turned = math.cos(angle) * SECOND_PROBE + math.sin(angle) * PROBE
+    found = name_single(show("disk_x", SECOND_PROBE, turned, 4e-4))
+    assert (found.name, found.unit, found.sure) == ("disk_x angle", "rad", True)
+    assert found.change == f"{abs(degrees):g} degrees {words} disk_y"
+    found = name_single(show("disk_x", SECOND_PROBE, SECOND_PROBE + math.sin(angle) * PROBE, 4e-4))
+    assert found.name == "disk_x crosstalk"

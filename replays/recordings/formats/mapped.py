@@ -17,7 +17,9 @@ from replays.recordings.formats.source import Entry, FileSignal, Source, even_ra
 from rig.base import units
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.text import find_similar
+from rig.channels.formula import Formulas
 from rig.channels.table import Channel, default_table
+from rig.physics.parameters import load_parameters
 
 BITS = 32
 """Word length of the counts of an imported channel."""
@@ -161,11 +163,11 @@ class Log:
                 raise InputError(where, must, name)
             if "/" in wanted.to or "/" in name or not wanted.to:
                 raise InputError(f"{where}.to", "a plain name", wanted.to)
-            target = _foreign_channel(name, wanted.to, units.canonical(wanted.to_unit))
-        elif wanted.to is not None or wanted.to_unit is not None:
-            raise InputError(
-                f"{where}.to", f"omitted, as {name} is one of the rig's channels", wanted.to or wanted.to_unit
-            )
+            if wanted.signal is not None:
+                Formulas(load_parameters().numbers()).column(name, wanted.signal)
+            target = _foreign_channel(name, wanted.to, units.canonical(wanted.to_unit), wanted.signal or "")
+        elif extra := wanted.to or wanted.to_unit or wanted.signal:
+            raise InputError(f"{where}.to", f"omitted, as {name} is one of the rig's channels", extra)
         unit = entry.unit if wanted.unit is None else wanted.unit
         volts = units.size_si(unit) if units.get_quantity(unit) == "voltage" else None
         if wanted.bits is not None:
@@ -243,10 +245,10 @@ class Log:
             self.remarks.append(f"{source.path.name}: {late_s:+.6f} s by the start times in the files{unsure}")
 
 
-def _foreign_channel(name: str, group: str, unit: str) -> Channel:
+def _foreign_channel(name: str, group: str, unit: str, signal: str) -> Channel:
     """Return a channel that the rig does not have."""
     return Channel(
-        name=name, label=name, group=group, signal="", unit=unit, si=units.size_si(unit), sensitivity_v=1.0,
+        name=name, label=name, group=group, signal=signal, unit=unit, si=units.size_si(unit), sensitivity_v=1.0,
         bias_v=0.0, range_v=(-1.0, 1.0), bandwidth_hz=1.0, highpass_hz=0.0, noise_v=0.0, adc_v=1.0, adc_bits=BITS,
         rate_hz=1, kind="imported",
     )  # fmt: skip

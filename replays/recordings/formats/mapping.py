@@ -180,6 +180,8 @@ class ChannelMapping(SignalName, LowPass):
     """Sensor group of a channel that the rig does not have."""
     to_unit: str | None = None
     """Unit of a channel that the rig does not have."""
+    signal: str | None = None
+    """Signal of the model that such a channel measures, or a formula as in a channel table; omitted: unknown."""
     label: str | None = None
 
     @field_validator("factor")

@@ -22,6 +22,7 @@ from rig.channels.sampling import has_few_positions, lagrange, sample_spacing
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.sensors.filters import delay_s
 from rig.channels.table import Channel, Group, default_table
+from rig.physics.kernels.signals import TRUTH
 from rig.run.offline import frames
 from rig.run.scenes import Scene, rig_table
 from rig.run.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
@@ -238,15 +239,22 @@ class Prediction:
 
     Attributes:
         values: Channels of each group on the recording's rows, in their units, shape (rows, channels).
-        truth: Truth tables [SI] from time zero on, shape (n, columns).
+        truth: Truth tables [SI] from `begin_s` on, shape (n, columns).
         truth_rate_hz: Rate of the truth tables [Hz].
         contacts: Contacts from the start of the experiment to shortly after the last row.
+        begin_s: Start of the simulation [s].
     """
 
     values: dict[str, np.ndarray]
     truth: dict[str, np.ndarray]
     truth_rate_hz: int
     contacts: int = 0
+    begin_s: float = 0.0
+
+    def compute_turns(self, times_s: np.ndarray) -> np.ndarray:
+        """Return the angle of the shaft at times of the model's clock [revolutions], shape (n,)."""
+        theta = self.truth["state"][:, TRUTH["state"].index("theta")]
+        return np.interp(times_s, self.begin_s + np.arange(len(theta)) / self.truth_rate_hz, theta) / (2.0 * math.pi)
 
 
 class _Channels:
@@ -423,7 +431,7 @@ def predict(
             for frame in experiment.frames(simulation):
                 follow(frame)
         return Prediction({name: _test_signals(experiment.scene, part) for name, part in parts.items()}, {}, 1)
-    row_rate_hz = TICK_RATE_HZ // simulation.row_ticks
+    row_rate_hz, begin_s = TICK_RATE_HZ // simulation.row_ticks, simulation.tick / TICK_RATE_HZ
     taking = _channels(parts, experiment.scene, row_rate_hz=row_rate_hz)
     chunk_s = min(_CHUNK_S, last_s + 2e-3)  # includes the row of the last sample and some after it
     begin_tick = max(simulation.tick, _begin_tick(parts, taking, chunk_s=chunk_s, row_rate_hz=row_rate_hz))
@@ -452,6 +460,7 @@ def predict(
         truth={name: np.concatenate(blocks) for name, blocks in truth.items()},
         truth_rate_hz=experiment.scene.sensors.truth_rate_hz,
         contacts=simulation.health()["contacts"],
+        begin_s=begin_s,
     )
 
 

@@ -461,5 +461,6 @@ def calibration(recording: Recording, experiment: Experiment) -> list[str]:
     """Return the differences of the recording's channels from the scene's table, by default the rig's own."""
     if is_imported(recording):
         lacking = find_assumed_corners(recording)
-        return [f"no bandwidth given for {', '.join(lacking)}: half of the rate is assumed"] if lacking else []
+        text = f"no bandwidth given for {', '.join(lacking)}: half of the rate is assumed" if lacking else ""
+        return ["; ".join(filter(None, (text, recording.correction[0])))] if text or recording.correction[0] else []
     return calibration_off(recording.table, experiment.scene.table)

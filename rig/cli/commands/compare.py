@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Force, ReportFile
+from rig.cli.options import Force, ReportFile, RunOut, subtract_run_out
 from rig.cli.output.progress import reporting
 from rig.cli.output.provenance import origin
 from rig.cli.output.tables import Form, echo, echo_json, make_printable, new_table
@@ -25,6 +25,7 @@ def compare(
     first: Annotated[Path, typer.Argument(metavar="A", help="Recording (.mcap)")],
     second: Annotated[Path, typer.Argument(metavar="B", help="Recording (.mcap) to compare with it")],
     *,
+    runout: RunOut = None,
     report: ReportFile = None,
     force: Force = False,
     form: Form,
@@ -43,11 +44,12 @@ def compare(
         check_report(report, force=force)
     with reporting() as reporter:
         reporter.show("reading")
-        recordings = join([first]), join([second])
+        recordings = subtract_run_out(runout, join([first]), join([second]))
         reporter.show("comparing the phases")
         result = compare_recordings(*recordings)
         if report is not None:
-            write_report(result.report(origin(a=first.name, b=second.name)), report)
+            head = origin(a=first.name, b=second.name, correction=recordings[0].correction[0])
+            write_report(result.report(head), report)
     if form.as_json:
         echo_json(result.document())
     else:

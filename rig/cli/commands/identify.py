@@ -16,9 +16,11 @@ from rig.cli.options import (
     Parameters,
     RecordingFiles,
     ReportFile,
+    RunOut,
     ToS,
     parse_pairs,
     split_names,
+    subtract_run_out,
 )
 from rig.cli.output.progress import reporting
 from rig.cli.output.provenance import recording_origin
@@ -154,6 +156,7 @@ def identify(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE.toml", help="Write the fitted parameter set")
     ] = None,
+    runout: RunOut = None,
     report: ReportFile = None,
     search: Search,
     exact: Annotated[
@@ -176,7 +179,7 @@ def identify(
         check_set(output, force=force)
     if report is not None:
         check_report(report, force=force)
-    recording = join(files)
+    (recording,) = subtract_run_out(runout, join(files), log=True)
     name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
     with reporting(compiles=True) as reporter:
         identification, along = request.run(recording, search, exact=exact, progress=reporter.step)

@@ -9,13 +9,10 @@ from typing import Annotated
 import typer
 
 from rig.base.errors import InputError
-from rig.cli.options import FromS, RecordingFiles, ToS, split_names
+from rig.cli.options import FromS, RecordingFiles, RunOut, ToS, split_names, subtract_run_out
 from rig.cli.output.folder import check_folder
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import echo
-
-_RUNOUT_ORDERS = 32
-"""Components of the run-out waveform per revolution: dents of a twentieth of the circumference."""
 
 
 def plot(
@@ -25,9 +22,7 @@ def plot(
     only: Annotated[str | None, typer.Option(metavar="orbit,bode", help="Draw only these kinds of plots")] = None,
     from_s: FromS = None,
     to_s: ToS = None,
-    runout: Annotated[
-        Path | None, typer.Option("--run-out", metavar="FILE", help="Subtract the run-out of this slow-roll recording")
-    ] = None,
+    runout: RunOut = None,
     svg: Annotated[bool, typer.Option("--svg", help="Write pictures as SVG, not PNG")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Write tables as Parquet, not CSV")] = False,
 ) -> None:
@@ -39,13 +34,13 @@ def plot(
     """
     from recorder.reader import join
     from replays.plots.methods import list_pictures
-    from replays.plots.signals import measure_runout, read_signals
+    from replays.plots.signals import read_signals
 
     check_folder(output, field="--output")
     bounds = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
-    waveform = None if runout is None else measure_runout(join([runout]), orders=_RUNOUT_ORDERS)
-    signals = read_signals(recording, from_s=from_s, to_s=to_s, runout=waveform)
+    (recording,) = subtract_run_out(runout, recording)
+    signals = read_signals(recording, from_s=from_s, to_s=to_s)
     pictures, written = list_pictures(signals, split_names(only)), list[Path]()
     left_out: dict[tuple[str, str], tuple[list[str], InputError]] = {}
     with reporting() as reporter:

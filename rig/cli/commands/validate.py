@@ -14,7 +14,17 @@ import typer
 
 from rig.base.errors import InputError, SimulationError, Words
 from rig.base.outcome import Outcome
-from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges, split_names
+from rig.cli.options import (
+    Changes,
+    Engine,
+    Force,
+    RecordingFiles,
+    ReportFile,
+    RunOut,
+    SceneChanges,
+    split_names,
+    subtract_run_out,
+)
 from rig.cli.output.progress import reporting
 from rig.cli.output.provenance import recording_origin
 from rig.cli.output.tables import Form, Table, echo, echo_json, make_printable, new_table
@@ -46,6 +56,7 @@ def validate(
         bool, typer.Option("--declared", help="Apply the declared criteria even if every bit is equal")
     ] = False,
     blind: Annotated[bool, typer.Option("--blind", help="Ignore the faults that the recording declares")] = False,
+    runout: RunOut = None,
     report: ReportFile = None,
     budget: Annotated[
         Path | None,
@@ -81,14 +92,15 @@ def validate(
     overrides = {key: read_value(value) for key, value in texts.items()}
     options: dict[str, Any] = {"criteria": rules, "changes": overrides, "declared": declared, "blind": blind}
     if any(file.is_dir() for file in files):
-        if len(files) > 1 or report is not None or budget is not None:
-            raise InputError("FILE", "one folder, without --report and --budget", Words(" ".join(map(str, files))))
+        if len(files) > 1 or any(one is not None for one in (report, budget, runout)):
+            must = "one folder, without --report, --budget and --run-out"
+            raise InputError("FILE", must, Words(" ".join(map(str, files))))
         rows = _validate_folder(files[0], output or files[0], options, jobs=jobs, force=force)
         _show_folder(rows, output or files[0], form)
         return
     if output is not None:
         raise InputError("--output", "left out, except for a folder", str(output))
-    recording = join(files)
+    (recording,) = subtract_run_out(runout, join(files), log=True)
     with reporting(compiles=True) as reporter:
         result = hold(recording, step=reporter.step, budget=budget is not None, **options)
         origin = recording_origin(result.title, recording)

@@ -32,4 +32,5 @@ def origin(**subject: object) -> dict[str, str]:
 def recording_origin(name: str, recording: Recording) -> dict[str, str]:
     """Return the lines for a recording: file, scene, parameter set and seed, as far as known."""
     scene, parameters = recording.scene, recording.parameters
-    return origin(file=name, scene=scene.get("name"), parameter_set=parameters.get("set"), seed=scene.get("seed"))
+    known = {"scene": scene.get("name"), "parameter set": parameters.get("set"), "seed": scene.get("seed")}
+    return origin(file=name, **known, correction=recording.correction[0])

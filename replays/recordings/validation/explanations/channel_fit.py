@@ -50,6 +50,7 @@ class Shown:
             without noise.
         lasted_s: Times of the first and the last difference [s], if known.
         around: Times and expected values from before its rows to after them, each shape (m,); None: those of its rows.
+        turns: Angle of the shaft [revolutions], shape (n,), for a log; None otherwise.
     """
 
     channel: Channel
@@ -63,6 +64,7 @@ class Shown:
     counts: np.ndarray | None = None
     lasted_s: tuple[float, float] = (0.0, math.inf)
     around: tuple[np.ndarray, np.ndarray] | None = None
+    turns: np.ndarray | None = None
 
     @property
     def name(self) -> str:

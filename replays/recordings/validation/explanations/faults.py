@@ -60,11 +60,12 @@ def sensor_faults(
         rows = slice(part.count_rows(from_s), part.count_rows(end_s))
         expected, *shown_too = (one.values[name][rows] for one in (nominal, *others))
         floor = floors(part, expected, shown_too)
+        turns = nominal.compute_turns(part.times_s[rows]) if others else None
         shown += [
             Shown(
                 part.channels[c], part.times_s[rows], part.values[rows, c], expected[:, c], floor[:, c],
                 float(part.floor[c]), neighbours=partial(find_others, parts, nominal, part.channels[c]),
-                around=extend(part, nominal.values[name][:, c], rows.start, rows.stop),
+                around=extend(part, nominal.values[name][:, c], rows.start, rows.stop), turns=turns,
             )
             for c in smooth_columns(part)
         ]  # fmt: skip

@@ -25,6 +25,7 @@ from replays.recordings.validation.explanations.channel_fit import (
 from replays.recordings.validation.explanations.explanation import excess, is_noise
 from replays.recordings.validation.explanations.signals import RAIL_ROWS, steady_rows
 from replays.recordings.validation.explanations.timing import ac_coupled, delayed_by, filtered, late, ringing
+from rig.base.units import get_quantity
 from rig.channels.faults.defects import DEFECTS, size_text
 
 _EXACT_PART = 0.01
@@ -33,6 +34,10 @@ _EXPLAINED_PART = 0.05
 """Largest remaining part of an explained difference, if the model is not exact."""
 _MIN_HUM_PERIODS = 1.5
 """Fewest periods of a hum."""
+_MAX_ANGLE_STEP = 0.1
+"""Largest error of a probe's angle by its projections [rad]."""
+_RUNOUT_ORDERS, _MAX_SHOWN_ORDERS = (1, 2, 4, 8, 16, 32), 4
+"""Numbers of components of a run-out that are tried, and most of them in its text."""
 _MAX_HUM_HZ = 1000.0
 """Highest frequency of a hum."""
 _COMPLEX_LAWS = ("resonance", "wander")
@@ -265,6 +270,7 @@ def _fit_times(one: Shown) -> Iterator[Law]:
     change = f"{far:+.4g} {one.unit} in {math.exp(log_s):.3g} s"
     law = one.law("drift", float(far), residual, 3, change, unit=one.unit)
     yield from with_level(one, law, float(level - far), one.solve([1.0 - np.exp(-t / math.exp(log_s))], d)[1])
+    yield from _fit_runout(one)
     if not one.uniform:
         return
     period_s = length_s / (len(t) - 1)
@@ -295,6 +301,28 @@ def _fit_times(one: Shown) -> Iterator[Law]:
         yield from with_level(one, law, float(factors[0]), one.solve(columns(f, third)[1:], d)[1])
 
 
+def _fit_runout(one: Shown) -> Iterator[Law]:
+    """Yield a waveform that is periodic with the angle of the shaft, for a probe of a log."""
+    if one.turns is None or get_quantity(one.unit) != "length" or np.ptp(one.turns) < _MIN_HUM_PERIODS:
+        return
+    d, laws = one.values - one.expected, list[tuple[Law, float, np.ndarray]]()
+    for n in _RUNOUT_ORDERS:
+        angles = [2.0 * math.pi * k * one.turns for k in range(1, n + 1)]
+        waves = [wave(angle) for angle in angles for wave in (np.cos, np.sin)]
+        factors, residual = one.solve([one.level, *waves], d)
+        sizes = np.hypot(factors[1::2], factors[2::2])
+        one_turn = 2.0 * math.pi * np.outer(np.linspace(0.0, 1.0, 721), np.arange(1, n + 1))
+        span = float(np.ptp(np.cos(one_turn) @ factors[1::2] + np.sin(one_turn) @ factors[2::2]))
+        large = [k for k in np.argsort(-sizes)[:_MAX_SHOWN_ORDERS] if sizes[k] > _LEVEL_PART * span]
+        parts = ", ".join(f"{k + 1}X {sizes[k]:.2g}" for k in sorted(large))
+        change = f"{size_text('run-out', span, one.unit)} ({parts})"
+        # Equal to hum near a higher order, it is hum.
+        law = one.law("run-out", span, residual, 2 + n.bit_length(), change)
+        laws.append((law, float(factors[0]), one.solve(waves, d)[1]))
+    law, level, bare = min(laws, key=lambda fit: one.cost(fit[0].residual, fit[0].count))
+    yield from with_level(one, law, level, bare)
+
+
 def _fit_crosstalk(one: Shown) -> Iterator[Law]:
     """Yield crosstalk from another channel."""
     d, ones = one.values - one.expected, one.level
@@ -312,12 +340,28 @@ def _fit_crosstalk(one: Shown) -> Iterator[Law]:
         middle = float(signal.mean())
         bare = min((one.solve([signal - about], d)[1] for about in (0.0, middle)), key=rms_of)
         laws += with_level(one, law, float(level + part * middle), bare)
+        if one.counts is None and other.unit == one.unit and get_quantity(one.unit) == "length":
+            laws.append(_fit_angle(one, other.name, signal, count))
     if laws:
         # Channels with equal signals, such as opposite sides of a ring, are one source.
         best = min(laws, key=lambda law: one.cost(law.residual, count))
         least = one.cost(best.residual, count) + MARGIN
         alike = [law.change for law in laws if one.cost(law.residual, count) < least and law is not best]
         yield replace(best, change=" or ".join([best.change, *alike]))
+
+
+def _fit_angle(one: Shown, other: str, signal: np.ndarray, count: int) -> Law:
+    """Return the law of a probe at another angle, in the plane of a perpendicular one with an expected signal (n,)."""
+
+    def turned(angle: float) -> np.ndarray:
+        shown = math.cos(angle) * one.expected + math.sin(angle) * signal
+        return one.solve([one.level], one.values - shown)[1]
+
+    (own, part, _), _ = one.solve([one.expected, signal, one.level])
+    about = math.atan2(part, own)
+    angle = least_at(lambda angle: rms_of(turned(angle)), about - _MAX_ANGLE_STEP, about + _MAX_ANGLE_STEP)
+    change = f"{math.degrees(abs(angle)):.3g} degrees {'toward' if angle > 0.0 else 'away from'} {other}"
+    return one.law("angle", angle, turned(angle), count, change, unit="rad")
 
 
 def _fit_curves(one: Shown) -> Iterator[Law]:
