@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -242,3 +243,182 @@ CASES = tuple(
             analog=lambda v, _, a=a, b=b: v | {a: -v[b], b: -v[a]}) for a, b in (("ring_x", "ring_y"), PROBES[:2])]
     + [Case("hammer as lbf for N", "hammer gain .*as lbf for N", analog=_gain(("hammer",), 1.0 / 4.4482))]
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A drawn fault, or several.
+
+    Attributes:
+        case: The fault; its pattern matches the right name.
+        channels: Faulty channels; empty if the time of all is wrong.
+        size: Size as text.
+        over_noise: Size over what is detectable; above 1 a name is due, above 10 / 3 "cannot tell" is rare.
+        kin: Pattern of a name of the right class, on the right channels.
+    """
+
+    case: Case
+    channels: tuple[str, ...]
+    size: str
+    over_noise: float
+    kin: str
+
+
+def _coupled(name: str, hz: float) -> Callable[[Values, float], Values]:
+    def change(values: Values, rate_hz: float) -> Values:
+        from scipy.signal import butter, sosfilt, sosfilt_zi
+
+        sos = butter(1, hz, "highpass", fs=rate_hz, output="sos")
+        return values | {name: sosfilt(sos, values[name], zi=sosfilt_zi(sos) * values[name][0])[0]}
+
+    return change
+
+
+def _wrapped(name: str, half: float) -> SampleChange:
+    return lambda own_s, values: (own_s, values | {name: (values[name] + half) % (2.0 * half) - half})
+
+
+def lose_rows(names: tuple[str, ...], at_s: float, rows: int) -> SampleChange:
+    """Remove rows of some channels; their last rows repeat."""
+
+    def change(own_s: np.ndarray, values: Values) -> tuple[np.ndarray, Values]:
+        first = int(np.searchsorted(own_s, at_s))
+        lost = {n: np.r_[values[n][:first], values[n][first + rows :], values[n][-rows:]] for n in names}
+        return own_s, values | lost
+
+    return change
+
+
+def scan(step_s: float) -> Callable[[Values, float], Values]:
+    """Sample each channel a step later than the one before it."""
+
+    def change(values: Values, rate_hz: float) -> Values:
+        rows = np.arange(len(values["speed"]))
+        return {
+            name: one if name == "keyphasor" else np.interp(rows + n * step_s * rate_hz, rows, one)
+            for n, (name, one) in enumerate(values.items())
+        }
+
+    return change
+
+
+def _warming(name: str, size: float, time_s: float) -> Callable[[Values, float], Values]:
+    return _added(name, lambda t: size * (1.0 - np.exp(-t / time_s)))
+
+
+KINDS = (
+    "offset", "gain", "polarity", "swap", "delay", "freeze", "clip", "hum", "AC coupling", "bandwidth", "wrap",
+    "crosstalk", "drift", "lost samples", "scanner", "clock", "two",
+)  # fmt: skip
+"""Kinds of drawn faults."""
+
+
+def draw_fault(kind: str, rng: np.random.Generator, motion: Motion, rows: int, hit_s: float) -> Drawn:
+    """Draw a fault of a kind with its channels and size.
+
+    An offset or a gain is detectable from three standard deviations of the mean of the noise on, a gain also has to be
+    twice the calibration's uncertainty; the other faults from a deviation of one noise (RMS) on.
+
+    Args:
+        kind: One of `KINDS`.
+        rng: Generator.
+        motion: Ideal signals.
+        rows: Rows that a validation compares.
+        hit_s: Time of the hammer pulse [s].
+    """
+    if kind == "two":
+        a, b = (draw_fault(each, rng, motion, rows, hit_s) for each in rng.choice(["gain", "offset", "hum"], 2, False))
+        both = Case(
+            "two", f"(?=.*{a.case.pattern})(?=.*{b.case.pattern})",
+            analog=lambda values, hz: b.case.signals(a.case.signals(values, motion), motion),
+        )  # fmt: skip
+        return Drawn(both, a.channels + b.channels, f"{a.size}; {b.size}", min(a.over_noise, b.over_noise), a.kin)
+    names = (*PROBES, *FORCES, *HOUSINGS)
+    name = str(rng.choice(FORCES if kind in ("AC coupling", "clip") else HOUSINGS if kind == "wrap" else names))
+    first = round(hit_s * motion.rate_hz)
+    signal, noise = motion.values[name][first:], NOISE[name]
+    swing, mean_noise = float(signal.std()), noise / np.sqrt(rows)
+    sign, channels = float(rng.choice([-1.0, 1.0])), (name,)
+
+    def log(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    def drawn(size: float, over: float, text: str = "", kin: str = "", **changes: Any) -> Drawn:
+        pattern = rf"{name} .*{text or kind}"
+        return Drawn(Case(kind, pattern, **changes), channels, f"{name} {size:.4g}", over, kin or rf"{name} ")
+
+    if kind == "offset":
+        size = sign * log(0.1, 300.0) * noise
+        return drawn(size, abs(size) / mean_noise / 3.0, analog=_gain((name,), 1.0, size))
+    if kind == "gain":
+        size = sign * log(0.002, 0.3)
+        over = min(abs(size) * swing / mean_noise / 3.0, abs(size) / 0.004)
+        return drawn(size, over, analog=_gain((name,), 1.0 + size))
+    if kind == "polarity":
+        return drawn(-1.0, 2.0 * swing / noise, "(polarity|swapped)", analog=_gain((name,), -1.0))
+    if kind == "swap":
+        kinds = [PROBES, FORCES, HOUSINGS][int(rng.integers(3))]
+        a, b = (str(one) for one in rng.choice(kinds, 2, False))
+        over = float((motion.values[a] - motion.values[b])[first:].std()) / NOISE[a]
+        pattern = f"(?=.*{a})(?=.*{b}).*(swapped|polarity|angle)"
+        return Drawn(Case(kind, pattern, analog=_swapped(a, b)), (a, b), f"{a} {b}", over, f"({a}|{b})")
+    if kind == "delay":
+        size = log(10e-6, 1e-3)
+        slope = float(np.gradient(signal).std()) * motion.rate_hz
+        return drawn(1e6 * size, size * slope / noise, "(delay|bandwidth)", analog=_late((name,), size))
+    if kind == "freeze":
+        size = log(5e-3, 50e-3)
+        return drawn(size, swing / noise, digital=_held(name, hit_s + 0.02, size))
+    if kind == "clip":
+        top = float(signal.mean() + (signal.max() - signal.mean()) * rng.uniform(0.3, 0.8))
+        return drawn(top, swing / noise, "(clip|freeze)", digital=_clipped(name, -1e9, top))
+    if kind == "hum":
+        size, hz = log(0.5, 300.0) * noise, float(rng.choice([50.0, 60.0, 100.0]))
+        added = _added(name, lambda t: size * np.sin(2.0 * np.pi * hz * t))
+        return drawn(size, size / np.sqrt(2.0) / noise, analog=added)
+    if kind == "AC coupling":
+        hz = log(0.5, 20.0)
+        return drawn(hz, 100.0, analog=_coupled(name, hz))
+    if kind == "bandwidth":
+        hz = log(100.0, 2500.0)
+        slow = _slow(name, hz)
+        over = float((slow(motion.values, motion.rate_hz)[name] - motion.values[name])[first:].std()) / noise
+        return drawn(hz, over, "(bandwidth|delay)", analog=slow)
+    if kind == "wrap":
+        half = float(np.abs(signal).max() * rng.uniform(0.4, 0.8))
+        return drawn(half, swing / noise, digital=_wrapped(name, half))
+    if kind == "crosstalk":
+        other = str(rng.choice([one for one in names if one != name]))
+        part = log(0.01, 0.3) * swing / float(motion.values[other][first:].std())
+        over = part * float(motion.values[other][first:].std()) / noise
+        return drawn(part, over, "(crosstalk|angle)", analog=_beside(name, other, part))
+    if kind == "drift":
+        size = log(3.0, 300.0) * noise
+        return drawn(size, size / noise / 10.0, analog=_warming(name, size, log(0.1, 2.0)))
+    if kind == "lost samples":
+        count, at_s = int(rng.integers(2, 30)), hit_s + rng.uniform(0.0, 0.03)
+        slope = float(np.gradient(signal).std()) * motion.rate_hz / 20e3
+        return drawn(count, count * slope / noise, "lost samples", digital=lose_rows((name,), at_s, count))
+    if kind == "scanner":
+        step = log(2e-6, 10e-6)
+        fault = Case(kind, r"scan", analog=scan(step))
+        return Drawn(fault, (), f"{1e6 * step:.3g} us", step / 1e-6, "delay")
+    ppm = sign * log(500.0, 5000.0)
+    return Drawn(Case(kind, "clock", ppm=ppm), (), f"{ppm:.0f} ppm", abs(ppm) / 300.0, "time|speed")
+
+
+def judge_names(drawn: Drawn, found: Validation) -> tuple[str, list[str], list[str]]:
+    """Return the judgement of a validation, the names that it gives, and the sound channels among them."""
+    names = [f"{one.channel} {one.what}" for one in found.faults]
+    names += [one.partition(":")[0] for one in found.beyond]
+    names += found.explained.best if found.explained is not None else ()
+    blamed = {word for one in names for word in re.findall(r"\w+", one) if word in NOISE}
+    sound = sorted(blamed - {*drawn.channels}) if drawn.channels else sorted(blamed)
+    if found.good:
+        return "passed", names, sound
+    text = "; ".join(names)
+    if not names:
+        return "cannot tell", names, sound
+    if re.search(drawn.case.pattern, text):
+        return "right", names, sound
+    return ("class" if re.search(drawn.kin, text) and not sound else "wrong"), names, sound

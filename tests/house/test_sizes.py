@@ -38,7 +38,7 @@ BUDGETS = {
     "replays/estimate": 546,
     "replays/player": 816,
     "replays/plots": 1754,
-    "replays/recordings": 12223,
+    "replays/recordings": 12388,
     "replays/report": 531,
     "replays/score": 4253,
     "replays/sessions": 77,

@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 import os
 import random
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from recorder import rewrite
+from recorder.files.payload import Payload
 from recorder.reader import Recording
 from recorder.rewrite import cut
 from replays.recordings.resimulation.experiment import Experiment
@@ -18,6 +23,8 @@ from replays.recordings.validation import validate
 from replays.recordings.validation.bits import Bits
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.single_channels import own_faults
+from rig.base.errors import InputError
+from rig.base.wire import EDGES, encode_block, sensor_key, truth_key
 from rig.channels.faults import KINDS
 from rig.channels.faults.defects import DEFECTS, alternatives, unit_of
 from rig.channels.table import default_table
@@ -26,6 +33,7 @@ from tests.physics.test_identification import recorded
 
 CHANNEL_KINDS = [name for name, kind in KINDS.items() if not kind.of_blocks]
 """Faults of blocks keep the counts, and are detected by the rows that are present."""
+PROBES_KEY = sensor_key("probes")
 PROBES, FORCES = ("disk_x", "disk_y", "ring_x", "ring_y"), ("P_N", "P_S", "P_E", "P_W")
 ACCELERATIONS = ("inner_x", "inner_y", "outer_x", "outer_y")
 FULL = {"disk": 0.25, "ring": 0.127, "P": 1000.0, "inner": 980.0, "outer": 980.0}
@@ -111,6 +119,73 @@ def test_a_recording_of_a_part_of_a_run_passes(tmp_path: Path) -> None:
     cut(faulty, tmp_path / "late.mcap", from_s=0.25, to_s=0.5)
     found = validate(Recording.open(tmp_path / "late.mcap"), blind=True)
     assert [one.line.partition(",")[0] for one in found.faults] == ["disk_x offset: +0.01 mm"]
+
+
+Change = Callable[[str, np.ndarray, np.ndarray], np.ndarray]
+
+
+def rewrite_values(source: Recording, output: Path, change: Change) -> Recording:
+    """Write a recording whose values are changed by a function of key, row numbers and values."""
+
+    def rewrite_block(payload: Payload) -> Payload:
+        if (block := payload.block) is None or payload.key == EDGES:
+            return payload
+        values = change(payload.key, block.index + np.arange(len(block.values)), block.values)
+        block = replace(block, values=values.astype(block.values.dtype))
+        return replace(payload, data=encode_block(block), block=block)
+
+    write = rewrite._write  # noqa: SLF001 (no public function changes values)
+    nothing = InputError("file", "a recording with rows", str(source.path))
+    write(source, output, metadata={}, reason="cut", force=True, change=rewrite_block, empty=nothing, on_progress=None)
+    return Recording.open(output)
+
+
+def splice(other: Recording, from_s: float, to_s: float = 9.0, by_s: float = 0.0, key: str = "") -> Change:
+    """Return a change that replaces rows of a time by those of a recording that are later by `by_s`."""
+
+    def change(name: str, index: np.ndarray, values: np.ndarray) -> np.ndarray:
+        if key and name != key:
+            return values
+        blocks = list(other.blocks(name))
+        there, rate_hz = np.concatenate([one.values for one in blocks]), float(blocks[0].rate_hz)
+        rows = np.clip(index - blocks[0].index + round(by_s * rate_hz), 0, len(there) - 1)
+        inside = (index >= from_s * rate_hz) & (index < to_s * rate_hz)
+        return np.where(inside[:, None], there[rows], values)
+
+    return change
+
+
+@pytest.mark.parametrize("key", ["", PROBES_KEY])
+def test_copied_rows_are_found_with_their_times(key: str, tmp_path: Path) -> None:
+    sound = recorded(tmp_path / "a.mcap", "hammer", duration_s=0.2)
+    found = validate(rewrite_values(sound, tmp_path / "b.mcap", splice(sound, 0.1, 0.12, by_s=0.05, key=key)))
+    copies = [one.line for one in found.faults if one.what == "doubled samples"]
+    assert "rows of probes from 0.1500 to 0.1699 s are equal bit for bit to those from 0.1000 s" in copies[0]
+    assert not any("delay" in one.line or "wander" in one.line for one in found.faults)
+    if not key:
+        assert "differ at once from 0.100" in found.faults[-1].line
+
+
+@pytest.mark.parametrize("other", [{"seed": 99}, {"drive__speed_hz": 6.0}])
+def test_a_splice_of_two_runs_is_found_with_its_time(other: dict[str, Any], tmp_path: Path) -> None:
+    sound = recorded(tmp_path / "a.mcap", "hammer", duration_s=0.2)
+    later = recorded(tmp_path / "b.mcap", "hammer", duration_s=0.2, **other)
+    found = validate(rewrite_values(sound, tmp_path / "c.mcap", splice(later, 0.14)))
+    (fault,) = found.faults
+    assert (fault.channel, fault.what, fault.from_s) == ("time", "other run", pytest.approx(0.14, abs=1e-4))
+    for changed in ({"contact.friction": 0.24}, {"seed": 5}) * ("seed" in other):  # no splice
+        assert not [one for one in validate(sound, changes=changed).faults if one.what == "other run"]
+
+
+def test_truth_that_contradicts_the_state_is_a_doubt(tmp_path: Path) -> None:
+    sound = recorded(tmp_path / "a.mcap", "hammer", duration_s=0.05)
+    contact = truth_key("contact")
+    changed = rewrite_values(
+        sound, tmp_path / "b.mcap", lambda key, _, values: values * (1.02 if key == contact else 1.0)
+    )
+    found = validate(changed)
+    assert not found.good
+    assert "truth/contact contradicts truth/state" in found.doubts[0]
 
 
 def some_fault(rng: random.Random) -> dict[str, Any]:

@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.validation.criteria import load_criteria
 from replays.recordings.validation.explanations.attribution import conclude
 from replays.recordings.validation.explanations.channel_fit import Shown
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import diagnose
-from replays.recordings.validation.explanations.signals import edge_faults
+from replays.recordings.validation.explanations.signals import edge_faults, find_copies
 from rig.channels.table import default_table
 
 RATE_HZ = 20e3
@@ -103,11 +104,65 @@ def test_a_clipped_channel_is_not_nonlinear() -> None:
     assert (found.name, found.change) == ("inner_x clip", "at -30 m/s^2 and 30 m/s^2")
 
 
+def lose_rows(signal: np.ndarray, at: int, rows: int) -> np.ndarray:
+    return np.r_[signal[:at], signal[at + rows :], np.full(rows, signal[-1])]
+
+
+@pytest.mark.parametrize("rows", [1, 7, -5])
+def test_rows_that_channels_lose_or_repeat_are_no_delay(rows: int) -> None:
+    at, shown = 2200, []
+    for name, signal, noise in (("P_W", FORCE, 1.0), ("disk_x", PROBE, 5e-4)):
+        kept = lose_rows(signal, at, rows)[:-8] if rows > 0 else np.r_[signal[:at], signal[at + rows : -8 + rows]]
+        one = show(name, signal, signal, noise)
+        noisy = kept + noise * np.random.default_rng(2).standard_normal(len(kept))
+        rest = {"times_s": TIMES_S[:-8], "expected": signal[:-8], "floor": one.floor[:-8]}
+        shown.append(replace(one, values=noisy, around=(TIMES_S, signal), **rest))
+    (found,) = diagnose(shown, float(TIMES_S[-1]))
+    assert found.name == f"P_W, disk_x {'lost' if rows > 0 else 'doubled'} samples"
+    assert found.change.startswith(f"{abs(rows)} rows from 0.8")
+    assert found.at_floor
+
+
+@pytest.mark.parametrize("size", [0.01, -0.1])
+def test_a_probe_that_warms_up_drifts(size: float) -> None:
+    warm = size * (1.0 - np.exp(-(TIMES_S - 0.7) / 0.06))
+    found = name_single(show("disk_x", PROBE, PROBE + warm, 5e-4))
+    assert found.name == "disk_x drift"
+    assert found.value == pytest.approx(size, rel=0.05)
+
+
+def measure(values: np.ndarray, noise: float = 1.0) -> Measured:
+    channels = tuple(default_table().channels[name] for name in ("P_N", "P_S"))
+    floor, random = np.full(2, noise), np.ones(2, dtype=bool)
+    times_s = np.arange(len(values)) / RATE_HZ
+    return Measured("forces", channels, times_s, np.arange(len(values)), values, floor, random, ideal=False)
+
+
+def test_rows_that_are_a_copy_have_their_times() -> None:
+    values = np.rint(np.random.default_rng(1).normal(0.0, 30.0, (4000, 2)))
+    assert not find_copies({"forces": measure(values)})
+    values[3000:3400] = values[1000:1400]
+    (found,) = find_copies({"forces": measure(values)})
+    assert (found.what, found.from_s, found.to_s) == ("doubled samples", 0.15, pytest.approx(0.16995))
+    assert "400 rows of forces from 0.1500 to 0.1699 s are equal bit for bit to those from 0.0500 s" in found.line
+    wave = np.rint(100.0 * np.sin(2.0 * math.pi * np.arange(4000) / 200.0))
+    assert not find_copies({"forces": measure(np.stack([wave, wave], axis=1))})
+
+
 def test_uneven_extra_pulses_are_not_missing_ones() -> None:
     edges = np.arange(20) / 6.25
     later = edges[8:] + 0.3 / 6.25
     faults = edge_faults(np.sort(np.r_[edges, later]), 0.5, 6.25)
     assert not [one for one in faults if one.what == "miss-pulses"]
+
+
+@pytest.mark.parametrize("place", [0.3, 0.6])
+def test_an_extra_pulse_in_every_turn_is_extra_and_a_missing_one_missing(place: float) -> None:
+    edges = np.arange(20) / 6.25
+    extra = np.sort(np.r_[edges, edges[:-1] + place / 6.25])
+    assert {one.what for one in edge_faults(extra, 9.0, 6.25)} == {"extra-pulses"}
+    assert {one.what for one in edge_faults(np.delete(edges, [3, 7, 12]), 9.0, 6.25)} == {"miss-pulses"}
+    assert not edge_faults(edges, 9.0, 6.25)
 
 
 @pytest.mark.parametrize("left", [1.5, 7.7])

@@ -126,6 +126,16 @@ def test_a_late_fast_clock_shows_earlier_values(experiment: Experiment) -> None:
     assert np.abs(found - model[200:600]).max() > 1e-2
 
 
+def test_a_scanner_samples_one_channel_after_another(experiment: Experiment) -> None:
+    names, times_s = ("ring_x", "P_E", "ring_y"), np.arange(200, 600) / 20_000
+    mapped = replace(experiment, mapped=names)
+    found = Predictor(mapped, ("clock.scan_us",), make_rows(names, times_s)).predict((50.0,)).values
+    model = shown(experiment, *names, end_s=0.04)
+    for late, (name, values) in enumerate(zip(names, model.T, strict=True)):
+        size = 0.02 * float(np.ptp(values)) + 1e-6
+        assert found[name][:-2, 0] == pytest.approx(values[200 + late : 598 + late], abs=size)
+
+
 def test_derivatives_are_secants_of_small_steps(experiment: Experiment) -> None:
     keys = ("magnet.stiffness", "contact.stiffness", "contact.friction", "hammer.1.force_n")
     parts = make_rows(("ring_x", "P_E"), np.arange(680) / 20_000)

@@ -36,6 +36,7 @@ from replays.recordings.resimulation.prediction import Measured, Prediction, rea
 from replays.recordings.resimulation.sensitivity import (
     ANGLE,
     PHASE,
+    SCAN,
     STATE,
     Predictor,
     get_scale,
@@ -59,10 +60,10 @@ NUISANCES = (
 )
 """Nuisance parameters. Clock and angle replace the time of the first pulse, as a simulation has pulses only at its
 ticks."""
-_PULSE = "hammer.1.at_s"
-_DEVIATIONS = {"clock.rate_ppm": 50.0, "clock.offset_s": 1e-4, "ring.offset_x": 0.1, "ring.offset_y": 0.1}
-"""Prior standard deviations: of a crystal [ppm], of a trigger found in filtered samples [s], and of a ring that was
-positioned by hand [mm]."""
+_PULSE, _RATE, _SPEED = "hammer.1.at_s", "clock.rate_ppm", "drive.speed_hz"
+_DEVIATIONS = {"clock.rate_ppm": 50.0, "clock.offset_s": 1e-4, SCAN: 10.0, "ring.offset_x": 0.1, "ring.offset_y": 0.1}
+"""Prior standard deviations: of a crystal [ppm], of a trigger found in filtered samples [s], of a scanner [us], and of
+a ring that was positioned by hand [mm]."""
 _RELATIVE = {"drive.speed_hz": 1e-4, "hammer.1.duration_ms": 0.01}
 """Relative prior standard deviations of a speed and a pulse length read from the log; `Experiment.unsure` has those of
 less certain values."""
@@ -117,8 +118,8 @@ class Fitted:
 
     @property
     def beyond(self) -> bool:
-        """True if the value is at the limit that its prior allows."""
-        return _is_beyond(self.value, self.prior)
+        """True if the value is at the limit that its prior allows, or if there should be none."""
+        return self.key == SCAN or _is_beyond(self.value, self.prior)
 
     @property
     def line(self) -> str:
@@ -130,6 +131,9 @@ class Fitted:
             return f"time: hammer pulse shifted by {late:+.1f} ±{1e6 * self.half_width:.2g} µs, fitted"
         if self.key == "clock.rate_ppm":
             return f"clock: {self.value:+.1f} ±{self.half_width:.2g} ppm fast, fitted"
+        if self.key == SCAN:
+            size = f"{self.value:+.3g} ±{self.half_width:.2g} µs"
+            return f"scanner: each channel is sampled {size} after the one before it in the mapping, fitted"
         if self.key == ANGLE:
             off = math.degrees(self.value - (self.prior[0] if self.prior else 0.0))
             text = f"{off:+.3g} ±{math.degrees(self.half_width):.2g} degrees"
@@ -363,11 +367,16 @@ def tune(
         if other.rank() > fit.rank():
             baseline, fit = early, other
     far = [key for key, value in zip(wanted, fit.values, strict=True) if _is_beyond(float(value), wanted[key])]
+    timed = get_value(baseline, _SPEED) != get_value(experiment, _SPEED)  # by edges, thus on the recorder's clock
+    if _RATE in far and timed and wanted.get(_SPEED):
+        far = list(dict.fromkeys([*far, _SPEED]))
     if far:
         widened = wanted | {key: (one[0], _PRIOR_WIDENING * one[1]) for key in far if (one := wanted[key]) is not None}
         fit = max(fit, _fit_best(baseline, widened, whole, progress), key=_WindowFit.rank)
     half = np.hypot(1.96 * np.sqrt(np.diag(fit.covariance) + np.mean(fit.moves**2, axis=0)), fit.jackknife)
     fitted = dict(zip(wanted, fit.values.tolist(), strict=True))
+    if _RATE in fitted and timed and (known := wanted.get(_SPEED)):
+        wanted[_SPEED] = known[0] * (1.0 + 1e-6 * fitted[_RATE]), known[1]
     # A prior keeps its width, around the prior mean.
     prior_widths = [1.96 * math.hypot(one[1], fitted[key] - one[0]) if one else math.inf for key, one in wanted.items()]
     return Tuned(

@@ -44,6 +44,7 @@ class Experiment:
         angle: Angle of the shaft in addition to `begin`, included in the scene's `shaft.unbalance_phase` [rad].
         mark: Known value of `angle` from the mark of the keyphasor, and its standard deviation [rad], or None.
         imported: Whether it is that of a log of another system.
+        mapped: Channels of such a log, in the order of its mapping.
     """
 
     scene: Scene
@@ -54,6 +55,7 @@ class Experiment:
     angle: float = 0.0
     mark: tuple[float, float] | None = None
     imported: bool = False
+    mapped: tuple[str, ...] = ()
 
     @classmethod
     def from_recording(cls, recording: Recording) -> Self:
@@ -82,7 +84,8 @@ class Experiment:
         mark = document.get("mark_deg") if begin is not None and len(_find_first_edges(recording, scene)) > 1 else None
         return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=document.get("unsure", {}),
                    mark=mark and (math.radians(mark[0]), math.radians(mark[1])),
-                   imported=is_imported(recording))  # fmt: skip
+                   imported=is_imported(recording),
+                   mapped=tuple(document.get("mapping", {}).get("channels", ())))  # fmt: skip
 
     def with_changes(self, changes: dict[str, Any]) -> Experiment:
         """Return the experiment with other values of scene or parameters, by dotted key, each in its own unit.

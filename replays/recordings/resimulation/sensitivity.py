@@ -28,8 +28,10 @@ from rig.run.motion import MotionStart
 from rig.run.scenes import Scene, change_scene, parse_scene
 from rig.run.simulation import TICK_RATE_HZ
 
-CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
-"""Delay of the recording's clock at its first sample, and its relative rate error: unit, size of a unit change."""
+SCAN = "clock.scan_us"
+CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3), SCAN: ("us", 10.0)}
+"""Delay of the recording's clock at its first sample, its relative rate error, and the time that a scanner needs from
+one channel to the next in the order of the mapping: unit, size of a unit change."""
 ANGLE = "shaft.angle_rad"
 """Angle of the shaft at the first sample, relative to that of the edges or of the scene [rad], independent of the speed
 before. For a log it is that at an edge."""
@@ -305,12 +307,28 @@ class Predictor:
     def _run(self, values: dict[str, float]) -> Prediction:
         self.runs += 1
         parts = to_model_clock(self.parts, values, about_s=self._about_s)
+        if SCAN in values:
+            parts = self._scan(parts, 1e-6 * values[SCAN])
         # Contacts after the window do not count.
         end_s = math.ceil(round((last_needed_s(parts) + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
         changed = with_values(self._experiment, {**values, "duration_s": end_s})
         if late := self._find_lateness(values):
             parts = {name: replace(part, times_s=part.times_s - late(part.times_s)) for name, part in parts.items()}
-        return predict(changed, parts, lead_ins=self._lead_ins)
+        found = predict(changed, parts, lead_ins=self._lead_ins)
+        if SCAN not in values:
+            return found
+        alone = {name: [found.values[f"{name} {one}"] for one in part.names] for name, part in self.parts.items()}
+        return replace(found, values={name: np.hstack(columns) for name, columns in alone.items()})
+
+    def _scan(self, parts: Mapping[str, Measured], step_s: float) -> dict[str, Measured]:
+        """Return each channel alone, at the times at which a scanner samples it."""
+        place = {name: n for n, name in enumerate(self._experiment.mapped)}
+        return {
+            f"{name} {one}": replace(
+                part.select_channels([one]), group=f"{name} {one}", times_s=part.times_s + step_s * place.get(one, 0)
+            )
+            for name, part in parts.items() for one in part.names
+        }  # fmt: skip
 
     def _find_lateness(self, values: Mapping[str, float]) -> Callable[[np.ndarray], np.ndarray] | None:
         """Return how much later signals come after a pulse of a fraction of a tick than after one of whole ticks [s].

@@ -17,7 +17,7 @@ from replays.recordings.identification.request import ask, first_command_s
 from replays.recordings.parameters import parameter_doubts
 from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured, simplify
-from replays.recordings.resimulation.sensitivity import with_values
+from replays.recordings.resimulation.sensitivity import SCAN, with_values
 from replays.recordings.validation.bits import Bits, StreamBits, missing_rows
 from replays.recordings.validation.criteria import Criteria, load_criteria
 from replays.recordings.validation.explanations.attribution import (
@@ -31,8 +31,14 @@ from replays.recordings.validation.explanations.budget import Budget, make_fit_b
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import find_common_delay, select_channels
 from replays.recordings.validation.explanations.model_parameters import find_changes
-from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, is_quiet, signal_faults
-from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
+from replays.recordings.validation.explanations.signals import (
+    SignalFault,
+    edge_faults,
+    find_copies,
+    is_quiet,
+    signal_faults,
+)
+from replays.recordings.validation.explanations.single_channels import find_other_runs, make_signal_faults, own_faults
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import CONTACT, PHASES, Phase
 from replays.recordings.validation.statistics import StatisticResult, make_quantity_reader, perturbed, statistics
@@ -45,12 +51,14 @@ from replays.recordings.validation.trajectory import (
     scaled,
     tolerate,
 )
-from replays.recordings.validation.truth import judge_truth, recorded_truth
+from replays.recordings.validation.truth import find_contradictions, judge_truth, recorded_truth
 from rig.base.errors import InputError, Words
 from rig.base.wire import TRUTH
 
 _CONTACT_MARGIN_S = 1e-3
 """Time before the first contact in the signals by which a difference is earlier [s]: that of filters."""
+_MIN_SCAN_RATIO = 3.0
+"""Smallest time between a scanner's channels over its half width."""
 _MAX_CHECKED = 3
 """Largest number of named numbers of the model that are checked by the phases."""
 
@@ -96,6 +104,8 @@ def validate(
     doubts = [*recording.doubts, *parameter_doubts(recording)]
     lost = missing_rows(recording) if blind else {}
     doubts += [f"{rows} of {due} rows of {key} are missing" for key, (rows, due) in lost.items()]
+    if not (criteria.floating or again.tuned):
+        doubts += find_contradictions(tables, again.nominal, [key for key, one in again.bits.items() if one.equal])
     back = [name for name, part in again.parts.items() if (np.diff(part.times_s) <= 0.0).any()]
     doubts += [f"times of {name} do not ascend: no quantity of its motion is judged" for name in back]
     # Test signals have no phases of motion, and no causes in it; unordered instants have no spectrum.
@@ -126,6 +136,9 @@ def validate(
         budgets=_make_budgets(again, phases, judged, step) if budget else (),
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
+    if again.tuned is None and again.faults:
+        text = "; ".join(one.line for one in again.faults)
+        return replace(validation, explained=_unexplained(again.faults[0].from_s, text))
     # Without the truth a number of the model may be the cause, if the difference begins with the recording.
     if again.own and (again.same_motion or (not firsts and all(one.sure for one in again.own))):
         return replace(validation, faults=make_signal_faults(again.own), explained=explain_by_defects(again.own))
@@ -152,13 +165,8 @@ def validate(
         return replace(validation, explained=attribute(
             again.quick, again.parts, again.nominal, rules, from_s=min(firsts), own=again.own, step=step
         ))  # fmt: skip
-    explained = _explain_log(again, from_s=min(firsts), end_s=end, touching=touching)
-    late_s = find_common_delay(explained.ranked, again.parts)
-    if late_s:
-        step("the same with channels of a kind late together")
-        other = _resimulate_log(recording, experiment, criteria, step, late_s=late_s)
-        if other.tuned is not None and other.tuned.is_better_than(again.tuned):
-            explained = _explain_log(other, from_s=min(firsts), end_s=min(end, other.tuned.end_s), touching=touching)
+    explain = partial(_explain_log, from_s=min(firsts), touching=touching)
+    explained = _explain_by_times(again, end, partial(_resimulate_log, recording, experiment, criteria, step), explain)
     named = [one for one in explained.ranked if one.kind == "model" and one.name in explained.best][:_MAX_CHECKED]
     if named and any(one.good is False for one in judged):
         # A change that removes the first part may only be the closest one.
@@ -315,10 +323,13 @@ def _resimulate(
         own = own_faults(
             parts, nominal, bits.differences, recording.edges(), bits.edges_s(), partial(predict, experiment), step
         )  # fmt: skip
+    faults: list[SignalFault] = []
+    if floated is None and not all(one.equal for one in streams.values()):
+        faults = [*find_copies(parts), *find_other_runs(parts, bits.differences)]
     valid = (Uncertainty("another build", moved), *(Uncertainty("fit", one) for one in members))
     return _Resimulation(
         quick, criteria, parts, nominal, valid, streams, None, floated.fitted if floated else (), members,
-        own=tuple(own), same_motion=same,
+        own=tuple(own), same_motion=same, faults=tuple(faults),
     )  # fmt: skip
 
 
@@ -337,11 +348,12 @@ def _resimulate_log(
     criteria: Criteria,
     step: Callable[[str], None],
     late_s: dict[str, float] | None = None,
+    more: tuple[str, ...] = (),
 ) -> _Resimulation:
     """Return the re-simulation of a log: unknown numbers are fitted, and their uncertainty is added to the floor."""
     rules = criteria.imported
     tuned = tune(
-        recording, experiment, rules.nuisances, priors=dict.fromkeys(criteria.floating), late_s=late_s,
+        recording, experiment, (*rules.nuisances, *more), priors=dict.fromkeys(criteria.floating), late_s=late_s,
         progress=lambda text: step(f"log: {text}"),
     )  # fmt: skip
     whole, longest_s = read_measured(recording, tuned.baseline.scene), criteria.window.longest_s
@@ -416,6 +428,27 @@ def _explain_log(again: _Resimulation, *, from_s: float, end_s: float, touching:
         again.parts, again.nominal, again.others, again.tuned, again.criteria.attribution, from_s=from_s, end_s=end_s,
         faults=again.faults, touching=touching,
     )  # fmt: skip
+
+
+def _explain_by_times(
+    again: _Resimulation,
+    end_s: float,
+    resimulate: Callable[..., _Resimulation],
+    explain: Callable[..., Explained],
+) -> Explained:
+    """Return the explanation of a log, after a further fit if channels seem late: of a kind together, or in turn."""
+    assert again.tuned is not None
+    explained = explain(again, end_s=end_s)
+    if late_s := find_common_delay(explained.ranked, again.parts):
+        other = resimulate(late_s=late_s)
+        if other.tuned is not None and other.tuned.is_better_than(again.tuned):
+            return explain(other, end_s=min(end_s, other.tuned.end_s))
+    elif again.tuned.end_s < again.tuned.longest_s and any("delay" in one.name for one in explained.ranked):
+        other = resimulate(more=(SCAN,))
+        sizes = [abs(one.value) / one.half_width for one in other.fitted if one.key == SCAN]
+        if other.tuned is not None and other.tuned.end_s > again.tuned.end_s and min(sizes) > _MIN_SCAN_RATIO:
+            return explain(other, end_s=other.tuned.end_s)
+    return explained
 
 
 def find_assumed_corners(recording: Recording) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +11,11 @@ from recorder.reader import Recording
 from replays.recordings.resimulation.prediction import Prediction
 from replays.recordings.validation.criteria import Criteria
 from replays.recordings.validation.phases import Phase
+from rig.base.wire import truth_key
 from rig.physics.kernels.signals import TRUTH
 
+_ROUNDING = 1e-6
+"""Relative difference by rounding, of tables of the same motion."""
 _CENTRE = 0.99
 """Contact truth is compared where the gap is below this part of the clearance."""
 
@@ -72,6 +76,25 @@ def judge_truth(
         worst = int(np.argmax(off / allowed))
         results.append(TruthResult(name, TRUTH[name][worst], float(off[worst]), float(allowed[worst])))
     return results
+
+
+def find_contradictions(tables: TruthTables, nominal: Prediction, equal: Collection[str]) -> list[str]:
+    """Return the truth tables that differ from those of the same motion, if the state is equal to the bit.
+
+    Args:
+        tables: Recorded tables.
+        nominal: Prediction.
+        equal: Keys of the streams that are equal to the bit.
+    """
+    found = []
+    for name, (index, values) in tables.items() if truth_key("state") in equal else ():
+        here = nominal.truth[name]
+        index, values = index[index < len(here)], values[index < len(here)]
+        off = np.abs(values - here[index]).max(axis=0, initial=0.0) / np.maximum(np.abs(here).max(axis=0), 1e-300)
+        if off.max() > _ROUNDING:
+            column = f"{TRUTH[name][int(off.argmax())]} by up to {off.max():.2g} of its largest value"
+            found.append(f"truth/{name} contradicts truth/state, which is equal to the bit: {column}")
+    return found
 
 
 def energy_change(

@@ -308,7 +308,28 @@ def _merge_equal(alone: list[_ChannelFault], explain: _ExplanationMaker, moving:
                 names, value, change = others, -value, size_text(kind, -value)
             before = np.concatenate([one.shown.apart for one in group])
             merged.append(explain(f"{', '.join(names)} {kind}", change, value, residual, before, DEFECTS[kind].unit))
-    return merged + [one.explanation for one in alone]
+    return merged + _merge_shifts([one.explanation for one in alone])
+
+
+def _merge_shifts(alone: list[Explanation]) -> list[Explanation]:
+    """Merge channels that lost or repeated equally many rows: channels of one device lose them together."""
+    found: dict[tuple[str, float], list[Explanation]] = {}
+    for one in alone:
+        what = one.channels_and_defect[1]
+        shared = what in ("lost samples", "doubled samples")
+        found.setdefault((what, one.value) if shared else (one.name, 0.0), []).append(one)
+    merged = []
+    for (what, _), group in found.items():
+        first = max(group, key=lambda one: one.explained)
+        if len(group) > 1:
+            names = ", ".join(one.channels_and_defect[0] for one in group)
+            squares, n = sum(one.squares for one in group), sum(one.n for one in group)
+            first = replace(
+                first, name=f"{names} {what}", explained=sum(one.explained for one in group), squares=squares, n=n,
+                left=math.sqrt(squares / n), sure=all(one.sure for one in group),
+            )  # fmt: skip
+        merged.append(first)
+    return merged
 
 
 class Clock:

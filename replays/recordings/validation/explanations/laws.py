@@ -24,7 +24,7 @@ from replays.recordings.validation.explanations.channel_fit import (
 )
 from replays.recordings.validation.explanations.explanation import excess, is_noise
 from replays.recordings.validation.explanations.signals import RAIL_ROWS, steady_rows
-from replays.recordings.validation.explanations.timing import ac_coupled, delayed_by, filtered, late, ringing
+from replays.recordings.validation.explanations.timing import ac_coupled, delayed_by, filtered, late, ringing, shifted
 from rig.base.units import get_quantity
 from rig.channels.faults.defects import DEFECTS, size_text
 
@@ -88,7 +88,7 @@ def law_of(one: Shown) -> Law:
         laws += _fit_crosstalk(one)
         laws += _fit_curves(one)
     if one.moves and one.even:
-        laws += [*late(one), *filtered(one), *ac_coupled(one)]
+        laws += [*late(one), *shifted(one), *filtered(one), *ac_coupled(one)]
     best = min((law for law in laws if law.sure), key=lambda law: one.cost(law.residual, law.count))
     rings = cache(lambda: list(ringing(one)))
     if one.counts is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,9 @@ _JUMP_FACTOR, _JUMP_QUANTILE = 10.0, 0.995
 """Second difference of a probe in a jump, relative to this quantile of all; inertia prevents it in a motion."""
 _NOISE_FACTOR = 3.0
 """Noise of a faulty channel relative to that of similar ones."""
+_MIN_COPIED_ROWS, _MAX_COPIED_PART, _MAX_COPIES = 16, 0.5, 8
+"""Fewest consecutive rows that are a copy, as noise does not repeat that often; largest part of rows that are copies,
+and largest number of distances from the original."""
 _MIN_QUIET_ROWS = 64
 """Fewest rows that show a noise to a tenth, far below the factor above."""
 
@@ -74,7 +78,7 @@ def signal_faults(parts: dict[str, Measured], quiet_s: float = math.inf) -> list
         parts: Recorded channels, in their whole length.
         quiet_s: Time up to which the shaft touches nothing [s]; a rub looks like noise of an accelerometer.
     """
-    faults = []
+    faults = find_copies(parts)
     for part in parts.values():
         faults += _find_jumps(part)
         quiet = part.values[: part.count_rows(quiet_s)]
@@ -117,6 +121,36 @@ def _find_jumps(part: Measured) -> list[SignalFault]:
     return [SignalFault("time", "lost samples", begin, end, text)]
 
 
+def find_copies(parts: Mapping[str, Measured]) -> list[SignalFault]:
+    """Return stretches of rows that are equal to others bit for bit, which noise prevents."""
+    faults = []
+    for name, part in parts.items():
+        noisy = [c for c, channel in enumerate(part.channels) if part.random[c] and channel.signal != "keyphasor"]
+        values = np.ascontiguousarray(part.values[:, noisy])
+        if not noisy or not len(values):
+            continue
+        _, rows = np.unique(values.view([("", values.dtype)] * len(noisy))[:, 0], return_inverse=True)
+        order = np.argsort(rows, kind="stable")
+        back = np.zeros(len(values), dtype=np.int64)  # distance to the same row before, or 0
+        back[order[1:]] = np.where(np.diff(rows[order]) == 0, np.diff(order), 0)
+        lags, counts = np.unique(back[back > _MIN_COPIED_ROWS], return_counts=True)
+        often = lags[np.argsort(-counts)][:_MAX_COPIES]
+        runs = [
+            (begin + lag, end - 1 + lag, lag)
+            for lag in often.tolist()
+            for begin, end in find_true_runs(rows[lag:] == rows[:-lag])
+            if end - begin >= _MIN_COPIED_ROWS
+        ]
+        if sum(last - first for first, last, _ in runs) > _MAX_COPIED_PART * len(values):
+            continue  # periodic motion without noise
+        for first, last, lag in runs:
+            from_s, to_s, other_s = (float(part.times_s[row]) for row in (first, last, first - lag))
+            text = f"{last - first + 1} rows of {name} from {from_s:.4f} to {to_s:.4f} s are equal bit for bit "
+            text += f"to those from {other_s:.4f} s on, in spite of noise: one is a copy"
+            faults.append(SignalFault("time", "doubled samples", from_s, to_s, text))
+    return faults
+
+
 def edge_faults(
     edges_s: np.ndarray, until_s: float, speed_hz: float, *, from_s: float = math.inf, period_s: float = 0.0
 ) -> list[SignalFault]:
@@ -146,6 +180,9 @@ def edge_faults(
         return faults
     turns = steps / np.median(steps)
     a_turn = 1.0 / (float(np.median(steps)) * speed_hz) if speed_hz > 0.0 else 1.0
+    uneven = speed_hz > 0.0 and np.abs(turns - 1.0).max() > _PULSE_TOLERANCE < abs(speed_hz * steps.mean() - 1.0)
+    if uneven:  # the median of many uneven turns is no turn
+        turns, a_turn = steps * speed_hz, 1.0
     if abs(a_turn - 1.0) > _PULSE_TOLERANCE:
         begin, end = float(edges_s[0]), float(edges_s[len(steps)])
         what = "extra-pulses" if a_turn > 1.0 else "miss-pulses"
@@ -156,6 +193,8 @@ def edge_faults(
             begin, end = float(edges_s[at[0]]), float(edges_s[at[-1] + 1])
             text = f"in {len(at)} of {len(steps)} turns, the first at {begin:.3f} s"
             faults.append(SignalFault("keyphasor", what, begin, end, text))
+    if uneven:
+        return faults
     off_s = np.where(np.abs(turns - 1.0) < 0.3, steps - np.median(steps), 0.0)
     least_s = max(_UNEVENNESS * 1.5 * float(np.median(np.abs(off_s))), _UNEVENNESS_S, _EDGE_SAMPLES * period_s)
     for at in np.flatnonzero(np.abs(off_s) > least_s):

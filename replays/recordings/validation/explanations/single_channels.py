@@ -31,6 +31,9 @@ _NO_FILTER = 1e4
 """Factor on a corner that removes the filter."""
 _MAX_EDGE_SHIFT = 0.1
 """Largest shift of an edge, in turns."""
+_MIN_FOREIGN_PART, _MIN_FOREIGN_CHANNELS, _MIN_FOREIGN_NOISE = 0.9, 0.75, 0.7
+"""Smallest parts of rows and of channels that differ in rows of another run, and smallest first difference over the
+noise; for independent noise it is 1.4."""
 _EVEN_S = 1e-5
 """Standard deviation of shifts of edges that count as equal."""
 
@@ -169,6 +172,42 @@ def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Exp
         explained=0.0, to_s=float(off[-1]),
     )  # fmt: skip
     return replace(explanation, from_s=float(off[0]))
+
+
+def find_other_runs(
+    parts: Mapping[str, Measured], apart: Callable[[str], tuple[np.ndarray, dict[str, np.ndarray]]]
+) -> list[SignalFault]:
+    """Return the rows that are of another run, as the probes and most other channels differ at once beyond their noise.
+
+    Motion that differs for another reason has equal noise, and inertia lets the probes differ gradually.
+
+    Args:
+        parts: Recorded channels.
+        apart: Function that returns, for a group, the differing rows and by channel their counts, shape (n,).
+    """
+    spans, differ = list[tuple[float, float]](), list[bool]()
+    for name, part in parts.items():
+        index, counts = apart(name)
+        rows = np.flatnonzero(np.isin(part.index, index))
+        at_once = len(rows) >= MIN_ROWS and len(rows) > _MIN_FOREIGN_PART * (rows[-1] - rows[0] + 1)
+        for one, random in zip(part.channels, part.random, strict=True):
+            if random and one.signal != "keyphasor":
+                off_v = one.scale * one.sensitivity_v * counts.get(one.name, np.zeros(1))[:MIN_ROWS]
+                differ.append(at_once and float(off_v.std()) + abs(off_v.mean()) > _MIN_FOREIGN_NOISE * one.noise_v)
+                if one.unit == "mm" and not differ[-1]:
+                    return []
+                if one.unit == "mm":
+                    spans.append((float(part.times_s[rows[0]]), float(part.times_s[rows[-1]])))
+    starts_s, ends_s = zip(*((part.times_s[0], part.times_s[-1]) for part in parts.values()), strict=True)
+    begins, ends = np.array(spans).reshape(-1, 2).T
+    if not spans or np.mean(differ) < _MIN_FOREIGN_CHANNELS:
+        return []
+    begin, end = float(begins.min()), float(ends.max())
+    if begin <= max(starts_s):
+        return []
+    until = f"to {end:.4f} s" if end < max(ends_s) - _MAX_DELAY_S else "on"
+    text = f"all probes differ at once from {begin:.4f} s {until}, by other noise or a jump: "
+    return [SignalFault("time", "other run", begin, end, f"{text}these rows are of another run or time")]
 
 
 def make_signal_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:

@@ -59,6 +59,8 @@ _MAX_CORNER_RATIO, _MIN_RESPONSE = 2.0, 1e-3
 """Largest corner tried, relative to the told one, and smallest response of the told filter that is inverted."""
 _MIN_SETTLED_PART = 0.3
 """Part of the difference that must remain after a filter has settled."""
+_MAX_SHIFT_ROWS = 400
+"""Largest number of lost or repeated rows of a channel in the search."""
 _MIN_COUPLING_TURNS, _MAX_COUPLING_PART = 0.02, 0.05
 """Lowest corner of an AC coupling that is searched, in periods in the window, and highest, as part of the rate."""
 _MAX_NOISE_PART = 0.8
@@ -235,6 +237,28 @@ def filtered(one: Shown) -> Iterator[Law]:
     if one.bare is not None and (rms_of(residual_by(1.0)) < _MAX_ALIAS_PART * rms_of(one.apart)):
         column = one.level if channel.highpass_hz else np.zeros(len(one.values))
         yield one.law("no-filter", 0.0, one.solve([column], one.values - one.bare())[1])
+
+
+def shifted(one: Shown) -> Iterator[Law]:
+    """Yield, for a log, a channel that lost or repeated rows: from one row on it is early or late by whole rows."""
+    if one.counts is not None or not one.uniform:
+        return
+    times_s, signal = one.around or (one.times_s, one.expected)
+    first, n = int(np.searchsorted(times_s, one.times_s[0])), len(one.values)
+    before = np.append(0.0, np.cumsum(one.apart[:-1] ** 2))
+    least = (math.inf, 0, 0, one.apart)
+    signal, first = np.pad(signal, _MAX_SHIFT_ROWS, mode="edge"), first + _MAX_SHIFT_ROWS
+    for rows in range(-_MAX_SHIFT_ROWS, _MAX_SHIFT_ROWS + 1):
+        residual = (one.values - signal[first + rows :][:n]) / one.floor
+        costs = before + np.cumsum(residual[::-1] ** 2)[::-1]
+        if costs.min() < least[0]:
+            least = (float(costs.min()), rows, int(costs.argmin()), residual)
+    _, rows, at, residual = least
+    # From the first row on it would be a delay.
+    if rows and at > MIN_ROWS:
+        what = "lost samples" if rows > 0 else "doubled samples"
+        change = f"{abs(rows)} rows from {one.times_s[at]:.4f} s"
+        yield one.law(what, float(abs(rows)), np.concatenate([one.apart[:at], residual[at:]]), 2, change, unit="")
 
 
 def ac_coupled(one: Shown) -> Iterator[Law]:
