@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import time
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -118,14 +119,16 @@ def mils(motion: second_rig.Motion, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def import_all_channels(
-    folder: Path, motion: second_rig.Motion, *, seed: int, case: faulty_logs.Case | None = None
+    folder: Path, motion: second_rig.Motion, *, seed: int, case: faulty_logs.Case | None = None, **noise: Any
 ) -> Recording:
-    """Return a recording of all channels with a fault."""
+    """Return a recording of all channels with a fault, and with coloured noise as of `second_rig.add_noise`."""
     fault = faulty_logs.Case("", "") if case is None else case
     own_s, values = second_rig.record_log(
         motion, seed=seed, ppm=fault.ppm, edit=lambda values: fault.signals(values, motion)
     )
     own_s, values = fault.samples(own_s, values)
+    if noise:
+        values = second_rig.add_noise(own_s, values, seed=seed, **noise)
     return import_log(folder, {"time": own_s, **values}, WHOLE)
 
 
@@ -522,7 +525,7 @@ def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
     """Five unknowns of a log from the middle of a run, and its pulse; other speeds, clocks, angles and noises."""
     seeds, rules = int(os.environ["RIG_COVERAGE_SEEDS"]), load_criteria().imported
     keys = (*FIVE, *PULSE)
-    held = np.zeros(len(keys), dtype=int)
+    held, sizes, spent_s = np.zeros(len(keys), dtype=int), [], []
     for seed in range(seeds):
         rng = np.random.default_rng(1000 + seed)
         mu, e, stiffness, eccentricity, damping = truth = np.array([0.25, 0.9, 1.7, 0.1, 238.0]) * (
@@ -539,24 +542,44 @@ def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
         )  # fmt: skip
         (folder := tmp_path / str(seed)).mkdir()
         recording = import_all_channels(
-            folder, motion, seed=seed, case=faulty_logs.Case("", "", ppm=rng.uniform(-80.0, 80.0))
+            folder, motion, seed=seed, case=faulty_logs.Case("", "", ppm=rng.uniform(-80.0, 80.0)),
+            slope=rng.choice([0.0, 0.5, 1.0, 1.5, 2.0]), level=rng.uniform(0.1, 0.9), lines=int(rng.integers(0, 4)),
         )  # fmt: skip
+        before_s = time.process_time()
         found = identify_log(
             recording, Experiment.from_recording(recording), FIVE, variants=[one.set for one in rules.variants],
             bandwidth=rules.bandwidth,
         )  # fmt: skip
         findings = {one.unknown.key: one for one in found.judgement.findings}
         pairs = zip(keys, (*truth, *pulse), strict=True)
-        off = np.array([(findings[key].value - t) / findings[key].half_width for key, t in pairs])
-        held += np.abs(off) < 1.0
-        print(seed, f"to {found.window.end_s:.3f} s:", " ".join(f"{one:+.2f}" for one in off), held, flush=True)
+        error, half = np.array([(findings[key].value - t, findings[key].half_width) for key, t in pairs]).T
+        held += np.abs(error) < half
+        sizes.append((error, half))
+        spent_s.append(time.process_time() - before_s)
+        off = " ".join(f"{one:+.2f}" for one in error / half)
+        print(seed, f"to {found.window.end_s:.3f} s in {spent_s[-1]:.0f} s:", off, held, flush=True)
+    error, half = np.moveaxis(np.array(sizes), 1, 0)
+    wide = np.median(half, axis=0) / (1.96 * error.std(axis=0))
+    print("half width over that of the spread:", wide.round(1), f"processor time {np.median(spent_s):.0f} s")
+    assert wide[: len(FIVE)].max() <= 5.0
     assert held.min() >= 0.85 * seeds
     for those in (held[: len(FIVE)], held):  # the pulse's values compensate for none of the five
-        assert those.sum() >= 0.91 * len(those) * seeds
+        assert those.sum() >= 0.9 * len(those) * seeds
 
 
 @slow_test
-@pytest.mark.parametrize("number", ["e = 0.85", "e = 0.89", "k_ns = 1.42e8", "K_bv = 1.29e7", "M_ih = 1.75"])
+@pytest.mark.parametrize(
+    "number",
+    [
+        "e = 0.85",
+        "e = 0.89",
+        "exponent = 1.42",
+        "v_s = 0.03",
+        "k_ns = 1.42e8",
+        "K_bv = 1.29e7",
+        "M_ih = 1.75",
+    ],
+)
 def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> None:
     name, _, value = number.partition(" = ")
     wrong = {"c": damping_factor(float(value))} if name == "e" else {name: float(value)}
@@ -568,6 +591,8 @@ def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> Non
     )  # fmt: skip
     for finding, truth in zip(found.judgement.findings, (0.25, 1.7), strict=False):
         assert finding.standing != "identified" or abs(finding.value - truth) < finding.half_width
+    assert "contact law" in found.why
+    assert "house stiffness" in found.why
 
 
 @MATRIX

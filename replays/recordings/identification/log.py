@@ -109,9 +109,12 @@ def identify_log(
     judgement = replace(judgement, findings=tuple(
         replace(one, unknown=replace(one.unknown, start=nominal[one.unknown.key])) for one in judgement.findings
     ))  # fmt: skip
-    why = "the model, or the search, does not explain later samples"
-    if tuned.end_s < tuned.longest_s and any(one.standing == "not seen" for one in judgement.findings[: len(keys)]):
-        why += "; later samples may show the missing values, with another --start or contact law"
+    why = f"the fit uses {1e3 * (tuned.longest_s - first_s):.3g} ms from the hammer pulse on"
+    if tuned.end_s < tuned.longest_s:
+        why = f"no values of these keys explain the samples to {tuned.longest_s:.4f} s: the contact law (exponent, "
+        why += "damping, friction law) or a number that is not fitted, such as a house stiffness, differs"
+        if any(one.standing == "not seen" for one in judgement.findings[: len(keys)]):
+            why += "; later samples may show the missing values: fit these numbers too, or use another --start"
     return Identification(
         question=question, judgement=_widen_intervals(judgement, moved * scale), window=window,
         z=z, stages=(), why=why, runs=window.runs, narrowed={},

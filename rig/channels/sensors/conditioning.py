@@ -29,6 +29,8 @@ from rig.physics.kernels.stage import kernel
 
 _LANES = 16
 """Channels processed in one pass, in SIMD lanes."""
+_WEIGHED_ROWS = 512
+"""Rows of one channel that are weighted at once, as they stay in the processor's cache."""
 _SUBNORMAL_GUARD_V = 1e-25
 """Offset of all voltages [V]: without it, filters of silent channels decay to subnormal numbers, 100 times slower."""
 _CHUNK = 64
@@ -109,11 +111,16 @@ def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
 
 @kernel
 def _weigh(taps, volts, out):
-    """Add the weighted rows to `out`, shape (n, channels), from `volts`, shape (n + taps - 1, channels)."""
-    for n in range(len(out)):
-        for tap in range(len(taps)):
-            for c in range(out.shape[1]):
-                out[n, c] += taps[tap, c] * volts[n + tap, c]
+    """Write the weighted rows to `out`, shape (n, channels), from `volts`, shape (n + taps - 1, channels)."""
+    for c in range(out.shape[1]):
+        column, summed = np.ascontiguousarray(volts[:, c]), np.zeros(len(out))
+        for first in range(0, len(out), _WEIGHED_ROWS):
+            part = summed[first : first + _WEIGHED_ROWS]
+            for tap in range(len(taps)):
+                weight, moved = taps[tap, c], column[first + tap : first + tap + len(part)]
+                for n in range(len(part)):
+                    part[n] += weight * moved[n]
+        out[:, c] = summed
 
 
 @kernel
@@ -399,7 +406,7 @@ class Conditioner:
             for c, tail in self._inherited_tails.items():
                 self._tail[len(self._tail) - len(tail) :, of.index(c)] = tail[-len(self._tail) :]
         volts = np.concatenate([self._tail, volts])
-        filtered = np.zeros((len(rows), len(of)))
+        filtered = np.empty((len(rows), len(of)))
         _weigh(self._taps, volts, filtered)
         self._tail = volts[len(rows) - 1 : -1]
         return (filtered - bias) / gain
