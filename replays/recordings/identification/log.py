@@ -1,9 +1,9 @@
 """Identification from a log of another system, with the unknowns of the log itself fitted along.
 
 The search is that of `nuisance.tune`, with the requested keys added, and the result is judged as any fit. In addition
-to the noise, the intervals include the last changes of the values as the window grew, a jackknife (model errors are not
-the same everywhere), and equally valid assumptions: a friction law that is continuous at zero speed, and filters with
-other corners.
+to the noise, the intervals include the last changes of the values as the window grew, and a jackknife (model errors are
+not the same everywhere). Equally valid assumptions, as filters with other corners and a friction law that is continuous
+at zero speed, are uncertainties that the noise includes: each explains only a residual of its own shape.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from replays.recordings.identification.nuisance import NUISANCES, find_nuisances
 from replays.recordings.identification.request import Question, ask, first_command_s
 from replays.recordings.identification.window import Window
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.resimulation.sensitivity import ANGLE, PHASE
 
 
@@ -75,39 +74,38 @@ def identify_log(
     )  # fmt: skip
     parts = {name: part.with_spectra(tuned.spectra) for name, part in question.observation.parts.items()}
     question = replace(question, observation=replace(question.observation, parts=parts))
-    progress("effect of filters with other corners")
+    progress("effect of filters with other corners, and of equally valid models")
+    nominal = _window(question).residuals(z := np.zeros(len(question.keys)))
     other = {name: part.with_corner_factor(bandwidth) for name, part in question.observation.parts.items()}
-    apart = _window(question, other).predicted(z := np.zeros(len(question.keys))) - _window(question).predicted(z)
-    louder = np.hypot(1.0, np.sqrt(np.nanmean(apart**2, axis=0)))
-    observation = question.observation
-    question = replace(question, observation=replace(observation, noise=observation.noise * louder))
-    window = _window(question)
+    observation = replace(question.observation, parts=other)
+    apart = nominal - _window(replace(question, observation=observation)).residuals(z)
+    unsure = [np.where(np.arange(apart.shape[1]) == c, apart, 0.0) for c in np.flatnonzero(apart.any(axis=0))]
+    for changes in variants:
+        model = question.experiment.with_changes(dict(changes))
+        unsure.append(nominal - _window(replace(question, experiment=model)).residuals(z))
+    window = _window(question, unsure)
     progress(f"fitted: {len(question.keys)} values, to {tuned.end_s:.4f} s; their intervals")
     slopes, residuals, valid = window.slopes_by_keys(z), window.residuals(z), window.valid
+    square, side = _priors(question)
+    flat = slopes.reshape(-1, len(z))
+    moved_z = solve_normal(square + flat.T @ flat, side + flat.T @ residuals.ravel())
+    moved_residuals = window.residuals_or_none(moved_z)
+    if moved_residuals is not None and (moved_residuals**2).sum() < (residuals**2).sum():
+        z, residuals = moved_z, moved_residuals
     scale = np.array([unknown.scale for unknown in question.unknowns])
     places = [list(tuned.values).index(key) for key in question.keys]
     moves = 1.96 * np.sqrt(np.mean(tuned.moves[:, places] ** 2, axis=0)) / scale
-    square, side = _priors(question)
     here = ChannelState(list(np.nan_to_num(residuals).T), list(np.moveaxis(slopes, 1, 0)))
-    times = [observation.times_s[: len(residuals)]] * len(here.apart)
+    times = [window.question.observation.times_s[: len(residuals)]] * len(here.apart)
     first_s = first_command_s(question.experiment)
     jackknife = jackknife_half_widths(here, times, [1.0] * len(times), (square, side), first_s)
     moved = np.hypot(jackknife, moves)
-    shown = [residuals - apart / louder]
-    for changes in variants:
-        shown.append(
-            _window(replace(question, experiment=question.experiment.with_changes(dict(changes)))).residuals(z)
-        )
-    flat = slopes.reshape(-1, len(scale))
-    for one in shown:
-        change = solve_normal(square + flat.T @ flat, flat.T @ np.nan_to_num(one - residuals).ravel())
-        moved = np.hypot(moved, np.abs(change))
     if mark is not None:
         moved[question.keys.index(PHASE)] += 1.96 * mark[1]
     judgement = judge(window, z, slopes, residuals, valid)
-    nominal = {one.key: one.start for one in tuned.fitted}
+    begun = {one.key: one.start for one in tuned.fitted}
     judgement = replace(judgement, findings=tuple(
-        replace(one, unknown=replace(one.unknown, start=nominal[one.unknown.key])) for one in judgement.findings
+        replace(one, unknown=replace(one.unknown, start=begun[one.unknown.key])) for one in judgement.findings
     ))  # fmt: skip
     why = f"the fit uses {1e3 * (tuned.longest_s - first_s):.3g} ms from the hammer pulse on"
     if tuned.end_s < tuned.longest_s:
@@ -121,11 +119,9 @@ def identify_log(
     )  # fmt: skip
 
 
-def _window(question: Question, parts: dict[str, Measured] | None = None) -> Window:
-    """Return the window of all samples of a question, optionally with other filters."""
-    if parts is not None:
-        question = replace(question, observation=replace(question.observation, parts=parts))
-    return Window(question, float(question.observation.times_s[-1]) + 1e-6)
+def _window(question: Question, unsure: Sequence[np.ndarray] = ()) -> Window:
+    """Return the window of all samples of a question."""
+    return Window(question, float(question.observation.times_s[-1]) + 1e-6, unsure)
 
 
 def _priors(question: Question) -> tuple[np.ndarray, np.ndarray]:

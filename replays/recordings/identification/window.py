@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from replays.recordings.identification.request import Question
@@ -16,7 +18,8 @@ _MIN_VARIANCE = 1e-20
 class Window:
     """Samples from the start of the question to some time, and their prediction.
 
-    Values are given as `z`: distances from the start of the search in scales, shape (unknowns,).
+    Values are given as `z`: distances from the start of the search in scales, shape (unknowns,). What is uncertain is
+    part of the noise: residuals and slopes are whitened with its covariance.
 
     Attributes:
         question: The request.
@@ -24,7 +27,14 @@ class Window:
         rows: Number of rows.
     """
 
-    def __init__(self, question: Question, end_s: float) -> None:
+    def __init__(self, question: Question, end_s: float, unsure: Sequence[np.ndarray] = ()) -> None:
+        """Predict a window.
+
+        Args:
+            question: The request.
+            end_s: End of the window [s].
+            unsure: Effects of one standard deviation of each uncertainty, over the noise, each shape (rows, channels).
+        """
         self.question = question
         self.end_s = end_s
         observation = question.observation
@@ -37,6 +47,9 @@ class Window:
         if any(part.spectra for part in parts.values()):
             self._measured = self._over_noise({name: part.values for name, part in parts.items()})
         self.valid = np.isfinite(self._measured)
+        effects = np.reshape([np.where(self.valid, one, 0.0) for one in unsure], (len(unsure), self._measured.size))
+        self._unsure, sizes, _ = np.linalg.svd(effects.T, full_matrices=False)
+        self._shrink = 1.0 - 1.0 / np.hypot(1.0, sizes)
 
     @property
     def runs(self) -> int:
@@ -59,7 +72,7 @@ class Window:
 
     def residuals(self, z: np.ndarray) -> np.ndarray:
         """Return measured minus predicted over the noise, 0 for lost samples, shape (rows, channels)."""
-        return np.where(self.valid, self._measured - self.predicted(z), 0.0)
+        return self._whiten(np.where(self.valid, self._measured - self.predicted(z), 0.0))
 
     def residuals_or_none(self, z: np.ndarray) -> np.ndarray | None:
         """Return the residuals; None if the model rejects the values."""
@@ -94,7 +107,12 @@ class Window:
         """Return the slopes by each value alone, in the predictor's own steps, shape (rows, channels, unknowns)."""
         slopes = self._predictor.derivatives(self.values(z)).slopes
         columns = [self._over_noise(one) * scale for one, scale in zip(slopes, self._scale, strict=True)]
-        return np.nan_to_num(np.stack(columns, axis=-1))
+        return self._whiten(np.nan_to_num(np.stack(columns, axis=-1)))
+
+    def _whiten(self, values: np.ndarray) -> np.ndarray:
+        """Return values over the noise, shape (rows, channels, ...), less what the uncertainties may cause."""
+        flat = values.reshape(len(self._unsure), -1)
+        return values - (self._unsure @ (self._shrink[:, None] * (self._unsure.T @ flat))).reshape(values.shape)
 
     def _over_noise(self, values: dict[str, np.ndarray]) -> np.ndarray:
         """Return values by group as one table over the noise, filtered so that it is white, shape (rows, channels)."""
