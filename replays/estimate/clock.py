@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from replays.estimate.intervals import student
+from replays.estimate.spool import add_up, blocks, find_extent, find_median, find_rows, running_sum, steps_of, transform
 
 _STEP_TOLERANCE = 0.2
 """Relative difference of steps of time stamps that count as equal."""
@@ -18,6 +19,8 @@ _MAX_SCATTER, _MIN_GAP = 5.0, 3.0
 """The same over the usual step for stamps of which some go back by jitter, and steps over the usual one from which rows
 are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak and steps of 2.5."""
 
+_LINE_ROWS = 1 << 18
+"""Rows of a line that are in memory at a time."""
 _MAX_CLOCK_STEPS, _MAX_STEP_PART = 4, 1e-3
 """Number of steps, or part of them, up to which they are steps of the clock or pauses, of any length."""
 
@@ -65,11 +68,13 @@ def fit_line(x: np.ndarray, y: np.ndarray) -> Line:
         x: Times of one clock or row numbers, shape (n,).
         y: Times of the other clock, or any values, shape (n,).
     """
-    centre, offset = float(x.mean()), float(y.mean())
-    apart = x - centre
-    spread = float(apart @ apart)
-    slope = float(apart @ (y - offset)) / spread if spread else 0.0
-    return Line(slope, centre, offset, x, y - offset - slope * apart)
+    centre, offset = add_up(x) / len(x), add_up(y) / len(y)
+    spread = common = 0.0
+    for rows in blocks(len(x), x, y, size=_LINE_ROWS):
+        apart = x[rows] - centre
+        spread, common = spread + float(apart @ apart), common + float(apart @ (y[rows] - offset))
+    slope = common / spread if spread else 0.0
+    return Line(slope, centre, offset, x, transform(lambda a, b: b - offset - slope * (a - centre), x, y))
 
 
 def time_error(slope: np.ndarray, residual: np.ndarray) -> float:
@@ -98,27 +103,29 @@ def find_rate(times_s: np.ndarray, max_hz: float) -> float | None:
     """
     if len(times_s) < 2:
         return None
-    steps = np.diff(times_s)
-    usual, resolution_s = float(np.median(steps)), find_resolution(steps)
-    large = np.abs(steps) > _MIN_GAP * max(usual, resolution_s)
-    alike = steps[np.abs(steps - usual) < _STEP_TOLERANCE * usual]
+    steps = steps_of(times_s)
+    usual, resolution_s = find_median(steps), find_resolution(steps)
+    alike = transform(lambda part: part[np.abs(part - usual) < _STEP_TOLERANCE * usual], steps)
     if usual >= 0.0 and len(alike) < _REGULAR_PART * len(steps):
         # Steps are multiples of a coarse resolution, or have jitter: a line shows the rate.
-        most_s = _MAX_ROUNDED * steps.max() if steps.min() >= 0.0 else _MAX_SCATTER * usual
-        gaps, counts = (usual > 0.0) & (steps > _MIN_GAP * usual), np.ones(len(steps))
-        late = missing = _fit_rows(times_s, counts)
+        least_s, largest_s = find_extent(steps)
+        most_s = _MAX_ROUNDED * largest_s if least_s >= 0.0 else _MAX_SCATTER * usual
+        late = missing = _fit_rows(times_s, transform(np.ones_like, steps))
         period_s = usual
-        for _ in range(2 if gaps.any() else 0):
-            counts[gaps] = np.rint(steps[gaps] / period_s)
+        for _ in range(2 if usual > 0.0 and largest_s > _MIN_GAP * usual else 0):
+            counts = transform(
+                lambda part, s=period_s: np.where(part > _MIN_GAP * usual, np.rint(part / s), 1.0), steps
+            )
             missing = _fit_rows(times_s, counts)
             period_s = max(missing[1], 1.0 / max_hz)
         scatter_s, period_s = min(late, missing)  # a large step is due to late stamps, or to missing rows
-        few = 0 < np.count_nonzero(large) <= max(_MAX_CLOCK_STEPS, _MAX_STEP_PART * len(steps))
+        large = find_rows(lambda part: np.abs(part) > _MIN_GAP * max(usual, resolution_s), steps)
+        few = 0 < len(large) <= max(_MAX_CLOCK_STEPS, _MAX_STEP_PART * len(steps))
         if few and not scatter_s <= _MAX_SCATTER * max(usual, resolution_s):
-            return find_rate(max(np.split(times_s, np.flatnonzero(large) + 1), key=len), max_hz)
+            return find_rate(max(np.split(times_s, large + 1), key=len), max_hz)
         if 0.0 < scatter_s <= most_s and period_s * max_hz >= 1.0:
             return 1.0 / period_s
-    alike_s, span_s = float(alike.sum()), max(0.0, float(times_s[-1] - times_s[0]))
+    alike_s, span_s = add_up(alike), max(0.0, float(times_s[-1] - times_s[0]))
     if len(steps) - len(alike) <= max(_MAX_CLOCK_STEPS, _MAX_STEP_PART * len(steps)):
         span_s = alike_s
     return None if 2.0 * alike_s <= span_s or len(alike) > max_hz * alike_s else len(alike) / alike_s
@@ -126,7 +133,8 @@ def find_rate(times_s: np.ndarray, max_hz: float) -> float | None:
 
 def find_resolution(steps_s: np.ndarray) -> float:
     """Return the median of those steps of time stamps that ascend [s]; 0 if none does."""
-    return float(np.median(steps_s[steps_s > 0.0])) if np.any(steps_s > 0.0) else 0.0
+    ascending = transform(lambda part: part[part > 0.0], steps_s)
+    return find_median(ascending) if len(ascending) else 0.0
 
 
 def _fit_rows(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
@@ -136,6 +144,6 @@ def _fit_rows(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
         times_s: The stamps [s], shape (n,).
         counts: Rows from each stamp to the next, shape (n - 1,).
     """
-    rows = np.append(0.0, np.cumsum(counts))
-    line = fit_line(rows, times_s)
-    return float(np.ptp(line.residual)), line.slope
+    line = fit_line(running_sum(counts), times_s)
+    low, high = find_extent(line.residual)
+    return high - low, line.slope

@@ -6,8 +6,9 @@ import math
 import mmap
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import IO
+from weakref import finalize
 
 import numpy as np
 
@@ -44,8 +45,10 @@ class Spool:
             return
         try:
             if self._file is None:
-                self._file = tempfile.TemporaryFile()  # noqa: SIM115 - the array keeps it open
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115 - an array has a copy of its descriptor
+                finalize(self, self._file.close)
             if self._file.fileno() > _MAX_FILES:
+                self._file.close()
                 self._file = None
                 return
             for each in self._parts:
@@ -89,6 +92,58 @@ def blocks(rows: int, *arrays: np.ndarray, size: int = ROWS) -> Iterator[slice]:
         release(*arrays)
 
 
+def transform(function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
+    """Return a function of arrays of equal length, computed and stored in blocks of rows."""
+    rows = len(arrays[0])
+    return spool(function(*(each[part] for each in arrays)) for part in blocks(rows, *arrays))
+
+
+def find_rows(condition: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
+    """Return the numbers of the rows in which a condition holds."""
+    return spool(rows.start + np.flatnonzero(condition(values[rows])) for rows in blocks(len(values), values))
+
+
+def are_equal(a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether two arrays have equal rows."""
+    return len(a) == len(b) and all(np.array_equal(a[rows], b[rows]) for rows in blocks(len(a), a, b))
+
+
+def steps_of(values: np.ndarray) -> np.ndarray:
+    """Return np.diff of values, shape (n,)."""
+    return spool(np.diff(values[rows.start : rows.stop + 1]) for rows in blocks(len(values) - 1, values))
+
+
+def running_sum(counts: np.ndarray) -> np.ndarray:
+    """Return 0 and the sums of the first 1, 2, ... whole numbers, of their type, shape (n + 1,)."""
+    sums, last = Spool(), counts[:0].sum()
+    sums.add(np.array([last]))
+    for rows in blocks(len(counts), counts):
+        sums.add(last + np.cumsum(counts[rows]))
+        last += counts[rows].sum()
+    return sums.array()
+
+
+def find_median(values: np.ndarray) -> float:
+    """Return np.median of float64 values without nan, by the digits of their bits; nan if there is none."""
+    if len(values) <= ROWS:
+        return float(np.median(values)) if len(values) else math.nan
+    middle = []
+    for rank in ((len(values) - 1) // 2, len(values) // 2):
+        key = 0
+        for shift in (48, 32, 16, 0):
+            counts = np.zeros(1 << 16, dtype=np.int64)
+            for rows in blocks(len(values), values):
+                bits = np.ascontiguousarray(values[rows]).view(np.uint64)
+                keys = np.where(bits >> 63, ~bits, bits | 1 << 63)  # in the order of the values
+                keys = keys if shift == 48 else keys[keys >> (shift + 16) == key]
+                counts += np.bincount((keys >> shift & 0xFFFF).astype(np.int64), minlength=1 << 16)
+            ends = np.cumsum(counts)
+            digit = int(np.searchsorted(ends, rank, side="right"))
+            rank, key = rank - int(ends[digit] - counts[digit]), key << 16 | digit
+        middle.append(np.uint64(key ^ 1 << 63 if key >> 63 else ~key & (1 << 64) - 1).view(np.float64))
+    return float(np.mean(middle))
+
+
 def find_extent(values: np.ndarray, offset: float = 0.0) -> tuple[float, float]:
     """Return the lowest and the highest value above an offset, without nan; nan if there is none."""
     with warnings.catch_warnings(action="ignore"):  # of blocks without values
@@ -103,15 +158,15 @@ def find_extent(values: np.ndarray, offset: float = 0.0) -> tuple[float, float]:
 def nan_mean(values: np.ndarray) -> float:
     """Return np.nanmean of values, shape (n,), to the last digit."""
     valid = sum(np.count_nonzero(~np.isnan(values[rows])) for rows in blocks(len(values), values))
-    return _add_up(values) / valid if valid else float("nan")
+    return add_up(values) / valid if valid else float("nan")
 
 
-def _add_up(values: np.ndarray) -> float:
+def add_up(values: np.ndarray) -> float:
     """Return np.nansum of values; the order of additions is that of numpy."""
     if len(values) > ROWS:
         half = len(values) // 2
         half -= half % 8
-        return _add_up(values[:half]) + _add_up(values[half:])
+        return add_up(values[:half]) + add_up(values[half:])
     total = float(np.nansum(values))
     release(values)
     return total

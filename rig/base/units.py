@@ -20,7 +20,7 @@ class _Unit:
     Attributes:
         quantity: The measured quantity.
         size: Size of the unit in the SI unit of the quantity.
-        zero: Zero of the unit in that unit; only for temperatures.
+        zero: Zero of the unit in that unit, for temperatures, and for Excel's serial days, of 1970.
     """
 
     quantity: str
@@ -142,6 +142,12 @@ def size_si(unit: str) -> float:
     """Return the size of a unit in SI; 1 for an unknown unit."""
     entry = _UNITS.get(canonical(unit))
     return entry.size if entry else 1.0
+
+
+def zero_of(unit: str) -> float:
+    """Return the number of a unit at the zero of the SI unit; 0 for an unknown unit."""
+    entry = _UNITS.get(canonical(unit))
+    return entry.zero if entry else 0.0
 
 
 def get_si_unit(unit: str) -> tuple[str, float, float]:

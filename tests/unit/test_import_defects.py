@@ -127,10 +127,26 @@ def test_a_defect_is_a_remark_or_an_error_of_one_line(
         assert "'ausser Bereich' (P_N)" in out
 
 
+UFF_HEAD = """    -1
+    58
+P_E
+NONE
+NONE
+NONE
+NONE
+    1         0    0         0       NONE         1   1       NONE         0   0
+         4{rows:10d}         1  0.00000e+00  1.00000e-03  0.00000e+00
+        17    0    0    0 Time                 s
+         9    0    0    0 NONE                 N
+         0    0    0    0 NONE                 NONE
+         0    0    0    0 NONE                 NONE"""
+
+
 @pytest.mark.parametrize(
     ("suffix", "rows", "name"),
-    [(".wav", 0, "log"), (".wav", 1, "log"), (".wav", ROWS, "log"), (".wav", ROWS, "a\nb"), (".uff", ROWS, "a\nb")],
-)
+    [(".wav", 0, "log"), (".wav", 1, "log"), (".wav", ROWS, "log"), (".wav", ROWS, "a\nb"), (".uff", 0, "log"),
+     (".uff", 1, "log"), (".uff", ROWS, "log"), (".uff", ROWS, "a\nb")],
+)  # fmt: skip
 def test_a_format_without_time_stamps(
     suffix: str, rows: int, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,18 +157,35 @@ def test_a_format_without_time_stamps(
 
         soundfile.write(path, values, round(RATE_HZ), subtype="PCM_24")
     else:
-        import pyuff
-
-        record = pyuff.prepare_58(
-            binary=0, id1="P_E", func_type=1, rsp_node=1, rsp_dir=1, ref_node=0, ref_dir=0, ord_data_type=4,
-            num_pts=rows, abscissa_spacing=1, abscissa_min=0.0, abscissa_inc=1.0 / RATE_HZ, z_axis_value=0.0,
-            abscissa_spec_data_type=17, ordinate_spec_data_type=9, ordinate_axis_units_lab="N",
-            orddenom_spec_data_type=0, z_axis_spec_data_type=0, data=values, x=N[:rows] / RATE_HZ,
-        )  # fmt: skip
-        pyuff.UFF(str(tmp_path / "x.uff")).write_sets(record, "overwrite")
-        (tmp_path / "x.uff").rename(path)
+        path.write_text(
+            "\n".join([*UFF_HEAD.format(rows=rows).splitlines(), *map("{:20.11e}".format, values), "    -1"])
+        )
     status, out, error = run_captured(capsys, "import", path, "-o", tmp_path / "out.mcap")
     assert (status, error.count("\n")) == ((0, 0) if rows > 1 else (2, 1)), out + error
     if rows > 1:
         groups = Recording.open(tmp_path / "out.mcap").table.groups.values()
         assert [group.rate_hz for group in groups] == [RATE_HZ]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".tdms"])
+@pytest.mark.parametrize("unit", ["excel days", "d"])
+def test_serial_days_of_a_spreadsheet_are_understood_if_told(
+    suffix: str, unit: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"log{suffix}"
+    WRITERS[suffix](path, 45000.5 + N / RATE_HZ / 86_400.0, unit, SIGNALS)
+    status, out, error = run_captured(capsys, "import", path, "-o", tmp_path / "out.mcap")
+    if unit == "d":
+        assert (status, error.count("\n")) == (2, 1)
+        assert 'file.time_unit must be set to "excel d"' in error
+        return
+    assert status == 0, error
+    assert "from 2023-03-15T12:00:00" in " ".join(out.split())
+    assert Recording.open(tmp_path / "out.mcap").samples("forces").rate_hz == RATE_HZ
+
+
+def test_serial_days_are_no_unit_of_an_mdf_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_mdf(tmp_path / "log.mf4", N / RATE_HZ, "excel d", SIGNALS)
+    status, _, error = run_captured(capsys, "import", tmp_path / "log.mf4", "-o", tmp_path / "out.mcap")
+    assert (status, error.count("\n")) == (2, 1)
+    assert "file.time_unit must be a unit of durations" in error

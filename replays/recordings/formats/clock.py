@@ -10,7 +10,17 @@ import numpy as np
 
 from replays.estimate.clock import Line, find_rate, find_resolution, fit_line
 from replays.estimate.spectra import parabola_top
-from replays.estimate.spool import blocks, find_extent
+from replays.estimate.spool import (
+    blocks,
+    find_extent,
+    find_median,
+    find_rows,
+    nan_mean,
+    running_sum,
+    spool,
+    steps_of,
+    transform,
+)
 from rig.base.errors import InputError, Words
 
 EVENNESS_TOLERANCE = 0.05
@@ -72,9 +82,14 @@ class TimeAxis:
         """Return received samples on the full axis, nan for missing ones, shape (rows,)."""
         if self.numbers is None:
             return values
-        whole = np.full(self.rows, np.nan)
-        whole[self.numbers] = values
-        return whole
+
+        def place(rows: slice) -> np.ndarray:
+            part = np.full(rows.stop - rows.start, np.nan)
+            first, last = np.searchsorted(self.numbers, (rows.start, rows.stop))
+            part[self.numbers[first:last] - rows.start] = values[first:last]
+            return part
+
+        return spool(place(rows) for rows in blocks(self.rows, values, self.numbers))
 
     @property
     def last_s(self) -> float:
@@ -123,16 +138,16 @@ def remove_steps(times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Cloc
     Returns:
         Time stamps [s], shape (n,), rows, int64, shape (n - 1,), and the steps in order.
     """
-    steps, rows = np.diff(times_s), len(times_s)
-    counts, period_s = np.ones(rows - 1, dtype=np.int64), 0.0
+    steps, rows, period_s = steps_of(times_s), len(times_s), 0.0
     if (rate := find_rate(times_s, 1.0 / _MIN_STEP_S)) is not None:
         period_s = 1.0 / rate
-    excess = steps - period_s
-    noise_s = _MAX_SCATTER * float(np.median(np.abs(excess)))
+    noise_s = _MAX_SCATTER * find_median(transform(lambda part: np.abs(part - period_s), steps))
     least_s = max(_MIN_STEP * max(period_s, find_resolution(steps)), noise_s)
-    odd = np.flatnonzero(np.abs(excess) > least_s) if period_s else np.empty(0, dtype=np.int64)
+    odd = find_rows(lambda part: (np.abs(part - period_s) > least_s) & (period_s > 0.0), steps)
+    counts = transform(lambda part: np.ones(len(part), dtype=np.int64), steps)
     if not len(odd):
         return times_s, counts, []
+    excess, counts = steps - period_s, np.array(counts)
     if noise_s < EVENNESS_TOLERANCE * period_s:  # single rows may be missing too
         counts = np.clip(np.rint(steps / period_s), 1, _MAX_ROWS).astype(np.int64)
         counts[odd] = 1
@@ -200,17 +215,17 @@ def make_axis(times_s: np.ndarray, *, line: bool, what: str) -> TimeAxis:
         InputError: There are fewer than two stamps, they do not ascend, or their mean interval is below 1 ns.
     """
     n = len(times_s)
-    if n < 2 or not np.isfinite(times_s).all():
+    if n < 2 or len(find_rows(lambda part: ~np.isfinite(part), times_s)):
         raise InputError("time stamps", "two or more finite numbers", Words(f"{what} with {n}"))
     times_s, counts, found = remove_steps(times_s)
-    steps, note = np.diff(times_s), "straight line through the time stamps"
-    if not np.all(steps > 0.0) and not line:
+    steps, note = steps_of(times_s), "straight line through the time stamps"
+    if not find_extent(steps)[0] > 0.0 and not line:
         at = int(np.argmax(steps <= 0.0)) + 1
         must = 'ascending (or set time.stamps = "line" or time.rate_hz)'
         raise InputError(
             "time stamps", must, Words(f"{what}, {times_s[at]:g} s after {times_s[at - 1]:g} s (row {at + 1})")
         )
-    numbers = np.concatenate([[0], np.cumsum(counts)])
+    numbers = running_sum(counts)
     whole = fit_line(numbers, times_s)
     step, jitter = whole.slope, _jitter(whole)
     if not step >= _MIN_STEP_S:
@@ -219,8 +234,10 @@ def make_axis(times_s: np.ndarray, *, line: bool, what: str) -> TimeAxis:
     even = line or jitter[1] < EVENNESS_TOLERANCE * step
     if not even:
         # Samples may be missing from an even axis, for example when a network dropped them.
-        places = np.concatenate([[0], np.cumsum(np.rint(steps / np.median(steps)))]).astype(np.int64)
-        if np.all(np.diff(places) > 0) and n <= places[-1] < _MAX_GAPS * n:
+        usual = find_median(steps)
+        apart = transform(lambda part: np.rint(part / usual), steps)
+        places = transform(lambda part: part.astype(np.int64), running_sum(apart))
+        if find_extent(apart)[0] > 0.0 and n <= places[-1] < _MAX_GAPS * n:
             kept = fit_line(places, times_s)
             if (spread := _jitter(kept))[1] < EVENNESS_TOLERANCE * kept.slope:
                 whole, numbers, jitter, even = kept, places, spread, True
@@ -235,7 +252,8 @@ def make_axis(times_s: np.ndarray, *, line: bool, what: str) -> TimeAxis:
 
 def _jitter(line: Line) -> tuple[float, float]:
     """Return the residual of the time stamps from their fitted line, rms and maximum [s]."""
-    return float(np.sqrt(np.mean(line.residual**2))), float(np.abs(line.residual).max())
+    low, high = find_extent(line.residual)
+    return math.sqrt(nan_mean(transform(np.square, line.residual))), max(-low, high)
 
 
 def interpolate_linear(values: np.ndarray, axis: TimeAxis, instants_s: np.ndarray) -> np.ndarray:

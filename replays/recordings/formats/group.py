@@ -178,6 +178,7 @@ def _group_rate(name: str, entries: Sequence[MappedSignal], mapping: Mapping) ->
         raise InputError("resample.rate_hz", f"{must}, if the file has rounded ones)", rates_text)
     if not _MIN_RATE_HZ <= rate <= _MAX_RATE_HZ:
         must = f'set with method "polyphase" or "linear", for rates outside {_MIN_RATE_HZ:g} to {_MAX_RATE_HZ:g} Hz'
+        must += " (or file.time_unit, if times are not in the unit assumed)"
         raise InputError("resample.rate_hz", must, rates_text)
     return rate
 

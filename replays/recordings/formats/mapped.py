@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from replays.estimate.spool import blocks, nan_mean, spool
+from replays.estimate.spool import are_equal, blocks, nan_mean, spool
 from replays.recordings.formats import clock
 from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalName
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
@@ -76,6 +76,7 @@ class Log:
         self.mapping = mapping
         self.sources = [open_source(path, mapping.file) for path in files]
         self.remarks = [f"{source.path.name}: {remark}" for source in self.sources for remark in source.remarks]
+        self._stamps: tuple[np.ndarray, clock.TimeAxis] | None = None  # of the signal before, often the same
         self._moves: list[tuple[str, str | None, clock.Shift]] = []  # by file, or by group in a file
 
     def find(self, wanted: SignalName, where: str) -> tuple[Source, Entry]:
@@ -123,7 +124,7 @@ class Log:
         axis = self._axis(signal, f"{entry.name} in {source.path.name}")
         signal = replace(signal, times_s=None)
         if axis.numbers is not None:
-            signal = replace(signal, values=spool([axis.place_samples(signal.values.astype(float))]))
+            signal = replace(signal, values=axis.place_samples(signal.values))
         return signal, axis
 
     def _axis(self, signal: FileSignal, what: str) -> clock.TimeAxis:
@@ -137,7 +138,10 @@ class Log:
             first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
             return clock.TimeAxis(first_s, time.rate_hz, rows, note="rate from the mapping")
         if signal.times_s is not None:
-            axis = clock.make_axis(signal.times_s, line=time.stamps == "line", what=what)
+            if self._stamps is None or not are_equal(self._stamps[0], signal.times_s):
+                axis = clock.make_axis(signal.times_s, line=time.stamps == "line", what=what)
+                self._stamps = (signal.times_s, axis)
+            axis = self._stamps[1]
             name = what.rpartition(" in ")[2]
             if axis.steps and (remark := f"{name}: {clock.describe_steps(axis.steps)}") not in self.remarks:
                 self.remarks.append(remark)

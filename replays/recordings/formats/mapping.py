@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, f
 
 from rig.base import units
 from rig.base.checks import check, read_toml
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 from rig.channels.table import FilterKind
 
 _EPOCH = re.compile(r"\b(unix|epoch|posix|since|from|the|1970(-01-01)?|utc)\b", re.IGNORECASE)
@@ -51,7 +51,7 @@ class FileOptions(_Section):
     time_column: str | Annotated[int, Field(ge=1)] | None = None
     """Time column, by name or number from 1; "none": no time column."""
     time_unit: str | None = None
-    """Unit of the time column: s, ms, us, ns, min, h, d, or datetime."""
+    """Unit of the time column: s, ms, us, ns, min, h, d, excel d (serial days from 1900), or datetime."""
     time_format: str | None = None
     """Format for Python's strptime of times that are not numbers, ISO 8601 or h:m:s."""
 
@@ -66,7 +66,7 @@ class FileOptions(_Section):
     @classmethod
     def _known_unit(cls, unit: str | None) -> str | None:
         if unit not in (None, "datetime") and units.get_quantity(_EPOCH.sub("", unit)) != "time":
-            raise ValueError("s, ms, us, ns, min, h, d or datetime")
+            raise ValueError("s, ms, us, ns, min, h, d, excel d or datetime")
         return unit
 
     def reject_text_options(self, path: Path) -> None:
@@ -79,8 +79,8 @@ class FileOptions(_Section):
             if getattr(self, name) is not None:
                 raise InputError(f"file.{name}", f"left out with {path.suffix} files", getattr(self, name))
 
-    def time_in_s(self, name: str, file_unit: str, first: float) -> tuple[str, float]:
-        """Return the unit of a numeric time column and its size [s].
+    def time_in_s(self, name: str, file_unit: str, first: float) -> tuple[str, float, float]:
+        """Return the unit of a numeric time column, its size [s] and the number at time zero.
 
         The unit is `time_unit`, or that of the file, or that of the heading ("Time [ms]", "time_ms"), or s. Numbers
         that can only be times since 1970 in ms, us or ns are recognised.
@@ -98,9 +98,12 @@ class FileOptions(_Section):
         unit = _EPOCH.sub("", (self.time_unit if self.time_unit != "datetime" else None) or file_unit or named).strip()
         unit = unit or next((each for least, each in _EPOCH_UNITS if least <= first), "s")
         if units.get_quantity(unit) != "time":
-            must = "set to s, ms, us, ns, min, h or d, as the unit of the time column is unknown or ambiguous"
+            must = "set to s, ms, us, ns, min, h, d or excel d, as the unit of the time column is unknown or ambiguous"
             raise InputError("file.time_unit", must, file_unit)
-        return units.canonical(unit), units.size_si(unit)
+        if self.time_unit is None and units.canonical(unit) == "d" and first >= units.zero_of("excel d"):
+            must = 'set to "excel d" (serial days of a spreadsheet, from 1900) or "d", as it is ambiguous'
+            raise InputError("file.time_unit", must, Words(f"{unit}, {first:.9g}"))
+        return units.canonical(unit), units.size_si(unit), units.zero_of(unit)
 
 
 class TimeOptions(_Section):

@@ -49,13 +49,13 @@ def look_into(path: Path, options: FileOptions) -> Source:
             for batch in file.iter_batches(_PIECE, row_groups=[group], columns=wanted, use_threads=False):
                 yield [batch.column(batch.schema.names.index(name)) for name in wanted]
 
-    scale, start, rate, base = 1.0, None, None, 0
+    scale, zero, start, rate, base = 1.0, 0.0, None, None, 0
     if stamps is not None and file.metadata.num_rows:
         (first,) = next(batches([stamps], [0]))
         start, base = first_instant(first), base_ns(first)
         if _numeric(schema.field(stamps).type):
-            scale = options.time_in_s(*headings[stamps], float(numbers(first, base)[0]))[1]
-        rate = even_rate_hz(numbers(first, base) * scale)
+            _, scale, zero = options.time_in_s(*headings[stamps], float(numbers(first, base)[0]))
+        rate = even_rate_hz((numbers(first, base) - zero) * scale)
     about = schema.metadata or {}
     entries = []
     for c, (name, unit) in enumerate(headings):
@@ -73,7 +73,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
         wanted = [entry.place for entry in entries]
         for columns in batches(wanted if stamps is None else [*wanted, stamps], range(file.num_row_groups)):
             arrays = [numbers(column, base) for column in columns]
-            part_s = None if stamps is None else arrays.pop() * scale
+            part_s = None if stamps is None else (arrays.pop() - zero) * scale
             yield [FileSignal(values=values, times_s=part_s) for values in arrays]
 
     kept = {key.decode(): text.decode(errors="replace") for key, text in about.items() if key != b"ARROW:schema"}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.estimate.spool import Spool, blocks, spool
+from replays.estimate.spool import Spool, transform
 from replays.recordings.formats.readers import columnar
 from replays.recordings.formats.readers.dialect import (
     MISSING,
@@ -65,13 +65,13 @@ def look_into(path: Path, options: FileOptions) -> Source:
     elif stamps is None and options.time_column is None and not layout.empty_first:
         stamps = _find_datetime_column(path, layout, options)
     start, base, rows, rate = layout.start, 0, 0, layout.rate_hz
-    unit, scale, epoch = "", 1.0, ()
+    unit, scale, zero, epoch = "", 1.0, 0.0, ()
     first = _first_fields(path, layout)
     stamps, date = (None, None) if options.time_column == "none" else _date_and_time(layout, first, stamps)
     if stamps is not None and layout.dialect.is_number(first[stamps]) and not options.time_format:
         missing = first[stamps] in ("", *MISSING, *options.missing)
         number = "nan" if missing else layout.dialect.normalise(first[stamps]).replace(layout.dialect.decimal, ".")
-        unit, scale = options.time_in_s(names[stamps], layout.units[stamps], float(number))
+        unit, scale, zero = options.time_in_s(names[stamps], layout.units[stamps], float(number))
         if float(number) >= _EPOCH_MS:
             epoch = (f"numbers of {names[stamps]} read as {unit} since 1970",)
     kept: list[list[Any]] | None = []
@@ -82,7 +82,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
                 if stamps is not None:
                     if not rows:
                         start, base = start or columnar.first_instant(part[stamps]), columnar.base_ns(part[stamps])
-                    part_s = columnar.numbers(part[stamps], base) * scale
+                    part_s = (columnar.numbers(part[stamps], base) - zero) * scale
                     if np.isnan(part_s).any():
                         line = layout.first + rows + int(np.argmax(np.isnan(part_s))) + 1
                         must = "a column without missing values"
@@ -105,7 +105,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         for part in _parse_columns(path, layout, options, stamps, date) if kept is None else kept:
-            part_s = None if stamps is None else columnar.numbers(part[stamps], base) * scale
+            part_s = None if stamps is None else (columnar.numbers(part[stamps], base) - zero) * scale
             yield [signal(columnar.numbers(part[entry.place]), part_s) for entry in entries]
 
     def signal(values: np.ndarray, times_s: np.ndarray | None) -> FileSignal:
@@ -122,7 +122,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     @cache
     def times_s() -> np.ndarray | None:
         stored = columns()[stamps] if stamps is not None else None
-        return None if stored is None else spool(stored[part] * scale for part in blocks(rows, stored))
+        return None if stored is None else transform(lambda part: (part - zero) * scale, stored)
 
     def read(entry: Entry) -> FileSignal:
         if layout.stamps is not None:

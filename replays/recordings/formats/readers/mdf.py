@@ -26,6 +26,7 @@ from replays.recordings.formats.source import (
     load_library,
     read_error,
 )
+from rig.base.errors import InputError
 from rig.base.files import find_data_limit, inflate, open_file
 
 if TYPE_CHECKING:
@@ -211,7 +212,12 @@ def _time_unit_s(mdf: Any, group: int, options: FileOptions) -> float | None:
     if getattr(master, "sync_type", _SYNC_TIME) not in (_SYNC_NONE, _SYNC_TIME):
         return None
     unit = str(master.unit or getattr(master.conversion, "unit", "") or "")
-    return options.time_in_s("", unit, 0.0)[1]
+    _, size_s, zero = options.time_in_s("", unit, 0.0)
+    if zero:
+        raise InputError(
+            "file.time_unit", "a unit of durations, such as s or d, with MDF files", options.time_unit or unit
+        )
+    return size_s
 
 
 def _numeric(mdf: Any, group: int, index: int) -> bool:

@@ -141,13 +141,15 @@ def _signal(group: Any, name: str, start: Any, options: FileOptions, times_name:
     if times_name is None or len(group[times_name]) != len(values):
         return FileSignal(values=values, scale=scale, offset=offset)
     stamps = group[times_name]
-    times = np.asarray(stamps[:])
-    if times.dtype.kind == "M":
+    if stamps.dtype.kind == "M":
+        times = np.asarray(stamps[:])
         times = (times - (times[0] if start is None else start)) / np.timedelta64(1, "us") * 1e-6
     else:
         unit = str(stamps.properties.get("unit_string", stamps.properties.get("NI_UnitDescription", "")))
         heading, named = parse_heading(times_name)
-        times = times.astype(float) * options.time_in_s(heading, unit or named, float(times[0]))[1]
+        _, size_s, zero = options.time_in_s(heading, unit or named, float(stamps.read_data(0, 1)[0]))
+        parts = (stamps.read_data(each.start, each.stop - each.start) for each in blocks(len(stamps), size=_PIECE))
+        times = spool((part.astype(float) - zero) * size_s for part in parts)
     return FileSignal(values=values, scale=scale, offset=offset, times_s=times)
 
 
