@@ -241,11 +241,13 @@ def simulate_pulse(
 LOW_PASSES = ("butterworth", "bessel", "chebyshev", "butterworth-2", "fir", "fir-compensated", "sinc")
 
 
-def apply_low_pass(kind: str, values: np.ndarray, rate_hz: float, corner_hz: float) -> np.ndarray:
+def apply_low_pass(
+    kind: str, values: np.ndarray, rate_hz: float, corner_hz: float, fir_half_s: float = 1.6e-3
+) -> np.ndarray:
     """Return a signal after one of `LOW_PASSES`, settled at its first value.
 
-    A Chebyshev has 0.5 dB of ripple; a FIR has 3.2 ms; "sinc" is that of a sigma-delta converter: three moving averages
-    in series. Corners are at -3 dB; of a Chebyshev the edge of the passband, of a FIR at -6 dB.
+    A Chebyshev has 0.5 dB of ripple; a FIR is twice `fir_half_s` long; "sinc" is that of a sigma-delta converter: three
+    moving averages in series. Corners are at -3 dB; of a Chebyshev the edge of the passband, of a FIR at -6 dB.
     """
     from scipy import signal
 
@@ -254,7 +256,7 @@ def apply_low_pass(kind: str, values: np.ndarray, rate_hz: float, corner_hz: flo
         average = np.ones(int(length) + 2)
         average[[0, -1]] = 0.5 * (length % 1.0)
         average /= average.sum()
-        half = round(1.6e-3 * rate_hz)
+        half = round(fir_half_s * rate_hz)
         taps = signal.firwin(2 * half + 1, corner_hz, fs=rate_hz)
         taps = np.convolve(np.convolve(average, average), average) if kind == "sinc" else taps
         ahead = half if kind == "fir-compensated" else 0
@@ -278,6 +280,7 @@ def record_log(
     ppm: float = 80.0,
     bandwidth_hz: float = 5000.0,
     low_pass: str | dict[str, str] = "butterworth",
+    fir_half_s: float = 1.6e-3,
     noise: float = 1.0,
     edit: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = lambda values: values,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -290,6 +293,7 @@ def record_log(
         ppm: Error of that clock [ppm]; positive: fast.
         bandwidth_hz: Of the low-pass before the converter; the speed's is 200 Hz.
         low_pass: Its kind, or kinds by channel; others and the speed have a fourth-order Butterworth.
+        fir_half_s: Half of the length of a linear-phase filter [s].
         noise: Factor of the sensors' noise.
         edit: Changes the signals before the filter: faults of sensors.
     """
@@ -303,7 +307,7 @@ def record_log(
     for name, values in edit(motion.values).items():
         kind = low_pass if isinstance(low_pass, str) else low_pass.get(name, "butterworth")
         slow = ("butterworth", 200.0) if name == "speed" else (kind, bandwidth_hz)
-        smooth = apply_low_pass(slow[0], values, motion.rate_hz, slow[1])
+        smooth = apply_low_pass(slow[0], values, motion.rate_hz, slow[1], fir_half_s)
         found[name] = CubicSpline(np.arange(len(smooth)), smooth)(place)
         found[name] += noise * NOISE[name] * rng.standard_normal(n)
     return own_s, found

@@ -138,15 +138,18 @@ def draw_log(folder: Path, seed: int, rig: second_rig.Rig | None = None) -> Reco
     turned, force_n, ppm = rng.uniform(0.0, 6.28), rng.uniform(80.0, 120.0), rng.uniform(-200.0, 200.0)
     rate_hz = 102_400.0 if seed % 10 == 9 else float(rng.choice([10e3, 12.8e3, 20e3, 25.6e3, 51.2e3]))
     kind, bandwidth_hz = list(LOW_PASSES)[seed % len(LOW_PASSES)], min(5000.0, 0.4 * rate_hz)
+    order = 32 * round(rate_hz / 10e3)  # of a fir, which is about 3.2 ms long
     motion = second_rig.simulate_pulse(rig, turned=turned, force_n=force_n, before_s=0.3, after_s=0.25, settled_s=2.0)
     own_s, values = second_rig.record_log(
-        motion, seed=seed, rate_hz=rate_hz, ppm=ppm, low_pass=kind, bandwidth_hz=bandwidth_hz
-    )
+        motion, seed=seed, rate_hz=rate_hz, ppm=ppm, low_pass=kind, bandwidth_hz=bandwidth_hz,
+        fir_half_s=0.5 * order / rate_hz,
+    )  # fmt: skip
     values = second_rig.add_noise(
         own_s, values, slope=rng.choice([0.0, 0.5, 1.0, 1.5, 2.0]), level=rng.uniform(0.1, 0.9),
         lines=int(rng.integers(0, 4)), seed=seed,
     )  # fmt: skip
     mapping = map_low_pass(kind).replace("bandwidth_hz = 5000", f"bandwidth_hz = {bandwidth_hz:g}")
+    mapping = mapping.replace("filter_order = 64", f"filter_order = {order}")
     return import_log(folder, {"time": own_s, **values}, mapping)
 
 

@@ -85,6 +85,8 @@ _WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """Lengths of the fit windows from the start of the hammer pulse [s]."""
 _MIN_GROWTH_S = 1.6e-3
 """Growth of the window up to which it is halved if residuals grow [s]."""
+_MAX_HALVINGS = 8
+"""Largest number of windows that are halved; each costs a fit."""
 _COUNTED_GROWTHS = 2
 """Last growths of the window whose changes of the values represent the error of the model."""
 _SEARCH_S = 5e-3
@@ -515,7 +517,7 @@ def _fit_windows(
     values = np.array([get_value(baseline, key) for key in wanted])
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
     jackknife, rows = np.zeros(len(values)), list[int]()
-    lengths, last_s = list(_WINDOWS_S), 0.0
+    lengths, last_s, halvings = list(_WINDOWS_S), 0.0, 0
     while lengths:
         length = lengths.pop(0)
         progress(f"{len(wanted)} values, to {first_s + length:.4f} s of {first_s + _WINDOWS_S[-1]:.3f} s")
@@ -538,7 +540,8 @@ def _fit_windows(
             if key not in NUISANCES and covariance[place, place] > 0.25 * priors[1, place] ** 2
         ]  # fmt: skip
         worse = any(b > _MAX_RMS_GROWTH * a for a, b in zip(scales, now, strict=False))
-        if worse and not unseen and length - last_s > _MIN_GROWTH_S:
+        if worse and not unseen and length - last_s > _MIN_GROWTH_S and halvings < _MAX_HALVINGS:
+            halvings += 1
             lengths = [0.5 * (last_s + length), length, *lengths]  # the step was too long for a linear model
             continue
         if scales and unseen and _is_worse(now, scales):

@@ -229,8 +229,8 @@ def explain_log(
         also = f"; {conclusion}" if best else ""
         best = (*(one.key for one in far), *best)
         conclusion = "outside the known uncertainty: " + "; ".join(one.line for one in far) + also
-    elif not best and cured and "closest is sensor" in conclusion:
-        pass  # the closest defect of a channel is stated, although more than noise is left
+    elif not best and cured:
+        pass  # the closest defects of channels are stated, although more than noise is left
     elif not best and faults:
         conclusion = f"first repair the faults of signals: {'; '.join(one.line for one in faults)}"
     elif not best and float(np.median(list(tuned.scales.values()))) > _MAX_MEDIAN_RESIDUAL:
