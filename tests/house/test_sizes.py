@@ -38,7 +38,7 @@ BUDGETS = {
     "replays/estimate": 590,
     "replays/player": 816,
     "replays/plots": 1754,
-    "replays/recordings": 12426,
+    "replays/recordings": 12428,
     "replays/report": 531,
     "replays/score": 4253,
     "replays/sessions": 77,
