@@ -356,8 +356,12 @@ class Daq(RowReader, Closing):
         ready = super()._take(rows, whole=whole)
         if ready is not None:
             lost = sum(self._aligner.lost.values())
-            self._source.report_position(ready.index + len(ready), room=self._room, lost=lost)
+            self._source.report_position(self._position(ready), room=self._room, lost=lost)
         return ready
+
+    def _position(self, ready: Samples) -> int:
+        """Return the row of the source that follows rows which were read."""
+        return ready.index + len(ready)
 
     def _on_samples(self, stream: str, samples: Samples) -> None:
         with self._changed:
@@ -375,9 +379,13 @@ class Daq(RowReader, Closing):
             self._source.report_position(samples.index, room=self._room, lost=0)
         complete = self._aligner.feed(stream, samples)
         for merged in complete:
-            self._buffer.add(merged)
+            self._add(merged)
         if complete:
             self._notify()
+
+    def _add(self, samples: Samples) -> None:
+        """Put complete rows into the buffer."""
+        self._buffer.add(samples)
 
     def _on_end(self, stream: str, reason: str) -> None:
         with self._changed:

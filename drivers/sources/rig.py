@@ -25,11 +25,18 @@ class RigSource:
         client: Transport to the rig.
         close: Called when the source is closed, for example to close the client.
         stream: Stream of that rig; a new one unless given.
+        counts: Pass on counts of the converters instead of engineering values.
     """
 
     def __init__(
-        self, client: Client, *, close: Callable[[], None] | None = None, stream: RigStream | None = None
+        self,
+        client: Client,
+        *,
+        close: Callable[[], None] | None = None,
+        stream: RigStream | None = None,
+        counts: bool = False,
     ) -> None:
+        self._counts = counts
         self._stream = stream or RigStream(client)
         self._client = client
         self._close = close
@@ -82,7 +89,8 @@ class RigSource:
                 return
             block = decimate(block, step)
             if len(block.values):
-                on_samples(group.name, Samples.from_block(block, group.names, units, group.engineering(block.values)))
+                values = block.values if self._counts else group.engineering(block.values)
+                on_samples(group.name, Samples.from_block(block, group.names, units, values))
 
         self._leave.append(
             self._stream.listen(wire.sensor_key(group.name), take, lambda reason: on_end(group.name, reason))

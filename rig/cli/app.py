@@ -51,6 +51,7 @@ COMMANDS = {
         "status": "Show the time, pace, lateness and losses of a running rig",
         "stop": "End the run of a rig and close its recordings",
         "twins": "Serve the simulated instruments of a running rig",
+        "daqmx": "Serve a running rig to programs that use nidaqmx, over gRPC",
         "can": "Run virtual CAN buses, and list the CAN messages of the rig",
     },
     "Replay a recording": {

@@ -21,13 +21,14 @@ LONGEST_FUNCTION = 120
 SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
-    "drivers": 710,
+    "drivers": 714,
     "drivers/can": 4538,
+    "drivers/daqmx": 1267,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
     "drivers/protection": 362,
-    "drivers/sources": 994,
+    "drivers/sources": 1001,
     "recorder": 1358,
     "recorder/contents": 1268,
     "recorder/files": 831,
@@ -46,7 +47,7 @@ BUDGETS = {
     "rig": 64,
     "rig/base": 1071,
     "rig/channels": 2591,
-    "rig/cli": 5999,
+    "rig/cli": 6041,
     "rig/ensemble": 2019,
     "rig/physics": 5488,
     "rig/run": 1896,

@@ -104,7 +104,8 @@ LEAN_ARGUMENTS = {
     "recover": "{rec} --force -o {folder}/recovered.mcap", "export": "{rec} --to 0.1 -o {folder}/run.csv",
     "keys init": "{folder}/keys --host 127.0.0.1 --keep-authority", "keys add": "{folder}/keys daq1",
     "keys remove": "{folder}/keys daq1", "completion": "bash", "hammer": "-h", "speed": "-h", "release": "-h",
-    "fault": "-h", "stop": "-h", "step": "-h", "status": "-h", "note": "-h", "twins": "-h", "record": "-h",
+    "fault": "-h", "stop": "-h", "step": "-h", "status": "-h", "note": "-h", "twins": "-h", "daqmx": "-h",
+    "record": "-h",
     "replay": "-h", "pause": "-h", "resume": "-h", "seek": "-h", "rate": "-h",
 }  # fmt: skip
 """Commands that docs/install.md promises without extras; for those of a running rig only the help is called."""

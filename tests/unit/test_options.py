@@ -148,6 +148,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
             "record -o x.mcap --trigger note --longest-s 1",
             "--longest-s must be at least --pre-s and --post-s, 2.5, at most 1e6; received 1.0",
         ),
+        ("daqmx --device a/b", "--device must be letters, digits and _; received 'a/b'"),
         (
             "twins --listen 0.0.0.0:1",
             "--listen must be on 127.0.0.1, since there is no password; from another machine: "

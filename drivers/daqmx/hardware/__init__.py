@@ -1,0 +1,1 @@
+"""The device: names, scales, outputs and errors."""

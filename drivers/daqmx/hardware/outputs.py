@@ -1,0 +1,81 @@
+"""Outputs of the device: digital lines and a set point that send commands to the rig."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from drivers.console import Console
+from drivers.daqmx.hardware.device import OUTPUT_LINES
+from drivers.daqmx.hardware.errors import Code, DaqmxError
+from rig.base.errors import InputError, RefusedError
+from rig.channels.table import Channel
+
+
+class Outputs:
+    """States of the outputs, shared by all tasks.
+
+    Args:
+        console: Console of the rig; None: the outputs are reserved, as commands are not allowed.
+        speed: Row of the channel table of the speed, whose sensitivity scales the set point.
+    """
+
+    def __init__(self, console: Console | None, speed: Channel | None) -> None:
+        self._console = console
+        self._speed = speed
+        self._lock = threading.Lock()
+        self.lines = dict.fromkeys(OUTPUT_LINES, False)
+        """State of each line of port0."""
+
+    def check(self) -> None:
+        """Raise an error unless commands are allowed.
+
+        Raises:
+            DaqmxError: They are not.
+        """
+        if self._console is None:
+            raise DaqmxError(
+                Code.RESOURCE_ALREADY_RESERVED, "outputs command the rig; start `rig daqmx` with --allow-commands"
+            )
+
+    def set_lines(self, states: dict[int, bool]) -> None:
+        """Set lines; a rising edge sends the command of its line.
+
+        Raises:
+            DaqmxError: The rig refused a command.
+        """
+        self.check()
+        with self._lock:
+            for number, state in states.items():
+                rises, self.lines[number] = state and not self.lines[number], state
+                if rises:
+                    self._send(OUTPUT_LINES[number])
+
+    def set_volts(self, volts: float) -> None:
+        """Set the speed set point by its voltage, on the scale of the speed channel.
+
+        Raises:
+            DaqmxError: The rig refused it.
+        """
+        self.check()
+        assert self._speed is not None
+        hertz = (volts - self._speed.bias_v) / self._speed.sensitivity_v
+        with self._lock:
+            self._command(lambda console: console.speed(hertz))
+
+    def _send(self, action: str) -> None:
+        actions: dict[str, Callable[[Console], Any]] = {
+            "hit": Console.hammer,
+            "stop": lambda console: console.speed(0.0),
+            "trip": Console.stop,
+            "release": Console.release,
+        }
+        self._command(actions[action])
+
+    def _command(self, command: Callable[[Console], Any]) -> None:
+        assert self._console is not None
+        try:
+            command(self._console)
+        except (RefusedError, InputError) as error:
+            raise DaqmxError(Code.INVALID_AO_DATA_WRITE, f"the rig refused the command: {error}") from None

@@ -1,0 +1,90 @@
+"""Scales of analogue input channels: from volts to the unit of a measurement, as the program defines it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nidaqmx import constants as c
+
+from drivers.daqmx.hardware.errors import refuse_value
+from rig.channels.table import Channel
+
+_GRAVITY, _POUND, _INCH, _MIL = 9.80665, 4.4482216152605, 25.4e-3, 25.4e-6
+"""Standard gravity [m/s^2], pound-force [N], inch and mil [m]."""
+_Accel, _Force, _Probe = (
+    c.AccelSensitivityUnits,
+    c.ForceIEPESensorSensitivityUnits,
+    c.EddyCurrentProxProbeSensitivityUnits,
+)
+_Velocity = c.VelocityIEPESensorSensitivityUnits
+_UNITS: dict[Any, float] = {
+    c.VoltageUnits.VOLTS: 1.0, c.BridgeUnits.VOLTS_PER_VOLT: 1.0, c.BridgeUnits.MILLIVOLTS_PER_VOLT: 1e-3,
+    c.AccelUnits.G: _GRAVITY, c.AccelUnits.METERS_PER_SECOND_SQUARED: 1.0,
+    c.AccelUnits.INCHES_PER_SECOND_SQUARED: _INCH,
+    c.ForceUnits.NEWTONS: 1.0, c.ForceUnits.POUNDS: _POUND, c.ForceUnits.KILOGRAM_FORCE: _GRAVITY,
+    c.LengthUnits.METERS: 1.0, c.LengthUnits.INCHES: _INCH,
+    c.VelocityUnits.METERS_PER_SECOND: 1.0, c.VelocityUnits.INCHES_PER_SECOND: _INCH,
+}  # fmt: skip
+"""SI value of each unit."""
+_SENSITIVITIES: dict[Any, float] = {
+    _Accel.MILLIVOLTS_PER_G: 1e-3 / _GRAVITY, _Accel.VOLTS_PER_G: 1.0 / _GRAVITY,
+    _Force.MILLIVOLTS_PER_NEWTON: 1e-3, _Force.MILLIVOLTS_PER_POUND: 1e-3 / _POUND,
+    _Probe.MILLIVOLTS_PER_MIL: 1e-3 / _MIL, _Probe.VOLTS_PER_MIL: 1.0 / _MIL,
+    _Probe.MILLIVOLTS_PER_MILLIMETER: 1.0, _Probe.VOLTS_PER_MILLIMETER: 1e3, _Probe.MILLIVOLTS_PER_MICRON: 1e3,
+    _Velocity.MILLIVOLTS_PER_MILLIMETER_PER_SECOND: 1.0, _Velocity.MILLIVOLTS_PER_INCH_PER_SECOND: 1e-3 / _INCH,
+}  # fmt: skip
+"""SI value of each unit of a sensitivity."""
+CALLS = {
+    "CreateAIVoltageChan": (c.UsageTypeAI.VOLTAGE, "AI_VOLTAGE"),
+    "CreateAIAccelChan": (c.UsageTypeAI.ACCELERATION_ACCELEROMETER_CURRENT_INPUT, "AI_ACCEL"),
+    "CreateAIForceIEPEChan": (c.UsageTypeAI.FORCE_IEPE_SENSOR, "AI_FORCE"),
+    "CreateAIVelocityIEPEChan": (c.UsageTypeAI.VELOCITY_IEPE_SENSOR, "AI_VELOCITY"),
+    "CreateAIPosEddyCurrProxProbeChan": (c.UsageTypeAI.POSITION_EDDY_CURRENT_PROX_PROBE, "AI_EDDY_CURRENT_PROX_PROBE"),
+    "CreateAIBridgeChan": (c.UsageTypeAI.BRIDGE, "AI_BRIDGE"),
+    "CreateAIForceBridgeTwoPointLinChan": (c.UsageTypeAI.FORCE_BRIDGE, "AI_FORCE"),
+}
+"""Measurement and prefix of the properties, by the call that creates a channel."""
+
+
+def get_scale(request: Any, channel: Channel) -> tuple[float, float]:
+    """Return gain and offset from volts to the unit of a request that creates a channel.
+
+    The bias of a channel is removed where a device couples the sensor by a capacitor, that is for IEPE sensors.
+
+    Args:
+        request: The request.
+        channel: Row of the channel table.
+
+    Raises:
+        DaqmxError: A unit is not supported, or the sensitivity or excitation is zero.
+    """
+    unit = _get_size(_UNITS, request, "units")
+    if hasattr(request, "sensitivity"):
+        sensitivity = _check(request.sensitivity, "sensitivity") * _get_size(
+            _SENSITIVITIES, request, "sensitivity_units"
+        )
+        gain = 1.0 / (sensitivity * unit)
+        return gain, -channel.bias_v * gain if hasattr(request, "current_excit_val") else 0.0
+    if not hasattr(request, "voltage_excit_val"):
+        return 1.0 / unit, 0.0
+    gain = 1.0 / _check(request.voltage_excit_val, "voltage_excit_val")
+    if not hasattr(request, "first_electrical_val"):
+        return gain / unit, 0.0
+    electrical, physical = _get_size(_UNITS, request, "electrical_units"), _get_size(_UNITS, request, "physical_units")
+    span = _check(request.second_electrical_val - request.first_electrical_val, "difference of the electrical values")
+    slope = (request.second_physical_val - request.first_physical_val) / span
+    offset = request.first_physical_val - request.first_electrical_val * slope
+    return gain / electrical * slope * physical / unit, offset * physical / unit
+
+
+def _get_size(sizes: dict[Any, float], request: Any, field: str) -> float:
+    found = {unit.value: size for unit, size in sizes.items()}
+    if (number := getattr(request, f"{field}_raw")) not in found:
+        refuse_value(field, "units that the device supports", number)
+    return found[number]
+
+
+def _check(value: float, what: str) -> float:
+    if value == 0.0:
+        refuse_value(what, "non-zero", value)
+    return value

@@ -1,0 +1,1 @@
+"""Calls of NI-DAQmx over gRPC, by subject."""

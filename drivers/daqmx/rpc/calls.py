@@ -1,0 +1,75 @@
+"""Calls of NI-DAQmx over gRPC: methods that handle all calls of a pattern, and end them with the vendor's errors."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NoReturn, TypeVar
+
+import grpc
+from nidaqmx._stubs import nidaqmx_pb2  # noqa: PLC2701
+from nidaqmx._stubs.nidaqmx_pb2_grpc import NiDAQmxServicer  # noqa: PLC2701
+
+from drivers.daqmx.hardware.errors import Code, DaqmxError
+from rig.base.errors import InputError, RefusedError
+
+CHECKED_VERSION = "1.7.0"
+"""Version of the package whose private messages were checked."""
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+def call(pattern: str) -> Callable[[_Method], _Method]:
+    """Make a method handle the calls of a pattern; it gets request, context, response and the groups of the pattern.
+
+    Args:
+        pattern: Regular expression of whole names. A generator handles calls with several responses.
+    """
+
+    def mark(method: _Method) -> _Method:
+        method.pattern = re.compile(pattern)  # type: ignore[attr-defined]
+        return method
+
+    return mark
+
+
+class Calls(NiDAQmxServicer):
+    """Servicer whose methods are marked by `call`; other calls are not implemented."""
+
+    def bind(self) -> None:
+        """Bind the methods to the calls of the protocol."""
+        methods = [getattr(self, name) for name in dir(type(self)) if hasattr(getattr(type(self), name), "pattern")]
+        for name in filter(str.isidentifier, vars(NiDAQmxServicer)):
+            for method in methods:
+                if match := method.pattern.fullmatch(name):
+                    handle = _stream if name.startswith("Register") else _respond
+                    setattr(self, name, partial(handle, method, f"{name}Response", match.groups()))
+
+
+def _respond(method: Any, response: str, groups: tuple[str, ...], request: Any, context: Any) -> Any:
+    result = getattr(nidaqmx_pb2, response)()
+    try:
+        method(request, context, result, *groups)
+    except (DaqmxError, InputError, RefusedError, ConnectionError, EOFError) as error:
+        _abort(context, request, error)
+    return result
+
+
+def _stream(method: Any, response: str, groups: tuple[str, ...], request: Any, context: Any) -> Any:
+    try:
+        yield from method(request, context, getattr(nidaqmx_pb2, response), *groups)
+    except DaqmxError as error:
+        _abort(context, request, error)
+
+
+def _abort(context: Any, request: Any, error: Exception) -> NoReturn:
+    """End a call with an error, in the metadata that the package reads."""
+    if isinstance(error, InputError | RefusedError):
+        error = DaqmxError(Code.INVALID_ATTRIBUTE_VALUE, str(error))
+    elif not isinstance(error, DaqmxError):
+        error = DaqmxError(Code.DEV_CANNOT_BE_ACCESSED, str(error))
+    task = request.task.name if hasattr(request, "task") else ""
+    name = f"\n\nTask Name: {task}" if task else ""
+    context.set_trailing_metadata((("ni-error", str(int(error.code))),))
+    context.abort(grpc.StatusCode.UNKNOWN, f"{error}{name}\n\nStatus Code: {int(error.code)}")
+    raise error

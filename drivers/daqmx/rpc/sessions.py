@@ -1,0 +1,253 @@
+"""Calls for tasks, timing, triggers and channels."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from nidaqmx import constants
+from nidaqmx.constants import ChannelType, TriggerType
+from nidaqmx.utils import unflatten_channel_string
+
+from drivers.daqmx.hardware import scaling
+from drivers.daqmx.hardware.device import Device
+from drivers.daqmx.hardware.errors import Code, DaqmxError, describe, refuse_value
+from drivers.daqmx.hardware.outputs import Outputs
+from drivers.daqmx.rpc.calls import Calls, call
+from drivers.daqmx.tasks import counters
+from drivers.daqmx.tasks.configuration import VirtualChannel
+from drivers.daqmx.tasks.task import Task
+from drivers.sources import Source
+from rig.base.errors import InputError
+
+_MAX_TASKS = 64
+_INITIALIZE, _ATTACH = 1, 2
+"""Behaviours for a session: a new one only, an existing one only."""
+
+
+class Sessions(Calls):
+    """Tasks of all programs.
+
+    Args:
+        device: The device.
+        outputs: Its outputs.
+        open_source: Opens a source of counts.
+    """
+
+    def __init__(self, device: Device, outputs: Outputs, open_source: Callable[[], Source]) -> None:
+        self._device, self._outputs, self._open_source = device, outputs, open_source
+        self._tasks: dict[str, Task] = {}
+        self._lock = threading.Lock()
+        self._numbers = itertools.count()
+        self.bind()
+
+    def close(self) -> None:
+        """Stop all tasks."""
+        for task in list(self._tasks.values()):
+            task.stop()
+
+    def task(self, request: Any) -> Task:
+        """Return the task of a request.
+
+        Raises:
+            DaqmxError: It does not exist.
+        """
+        if (task := self._tasks.get(request.task.name)) is None:
+            raise DaqmxError(Code.INVALID_TASK, f"{request.task.name!r} was cleared, or never created")
+        return task
+
+    # ---- tasks ----
+
+    @call("CreateTask")
+    def create_task(self, request: Any, _: Any, response: Any) -> None:
+        """Create a task, or attach to one."""
+        behaviour = request.initialization_behavior
+        with self._lock:
+            name = request.session_name or f"_unnamedTask<{next(self._numbers)}>"
+            exists = name in self._tasks
+            if (exists and behaviour == _INITIALIZE) or (not exists and behaviour == _ATTACH):
+                raise DaqmxError(Code.DUPLICATE_TASK if exists else Code.INVALID_TASK, name)
+            if len(self._tasks) >= _MAX_TASKS and not exists:
+                raise DaqmxError(Code.PAL_MEMORY_FULL, f"there are {_MAX_TASKS} tasks; clear some")
+            self._tasks.setdefault(name, Task(name, self._device, self._open_source))
+        response.task.name, response.new_session_initialized = name, not exists
+
+    @call("ClearTask|StopTask")
+    def stop_task(self, request: Any, _: Any, response: Any) -> None:
+        """Stop a task, and remove it if it is cleared."""
+        task = self.task(request)
+        if type(response).__name__.startswith("Clear"):
+            self._tasks.pop(task.name, None)
+        task.stop()
+
+    @call("StartTask")
+    def start_task(self, request: Any, *_: Any) -> None:
+        """Start a task."""
+        self.task(request).start()
+
+    @call("TaskControl")
+    def control_task(self, request: Any, *_: Any) -> None:
+        """Start, stop or verify a task; the other states have no effect."""
+        task, action = self.task(request), constants.TaskMode(request.action_raw)
+        if action is constants.TaskMode.TASK_START:
+            task.start()
+        elif action in (constants.TaskMode.TASK_STOP, constants.TaskMode.TASK_ABORT):
+            task.stop()
+        else:
+            task.plan()
+
+    @call("IsTaskDone")
+    def is_task_done(self, request: Any, _: Any, response: Any) -> None:
+        """Return whether a task is done."""
+        response.is_task_done = self.task(request).done
+
+    @call("WaitUntilTaskDone")
+    def wait_until_done(self, request: Any, context: Any, _: Any) -> None:
+        """Wait until a task is done."""
+        self.task(request).wait(request.time_to_wait, context.is_active)
+
+    @call("GetErrorString")
+    def get_error_string(self, request: Any, _: Any, response: Any) -> None:
+        """Return the text of an error code."""
+        response.error_string = describe(request.error_code)
+
+    @call("(Reset|SelfTest)Device")
+    def reset_device(self, request: Any, _: Any, __: Any, action: str) -> None:
+        """Stop all tasks; a self-test has no effect."""
+        self._device.check_name(request.device_name)
+        if action == "Reset":
+            self.close()
+
+    # ---- timing and triggers ----
+
+    @call("Cfg(SampClk|Implicit)Timing")
+    def configure_timing(self, request: Any, _: Any, __: Any, kind: str) -> None:
+        """Set the sample clock and the number of samples."""
+        task = self.task(request)
+        if task.kind in (ChannelType.DIGITAL_OUTPUT, ChannelType.ANALOG_OUTPUT):
+            refuse_value("SAMP_TIMING_TYPE", "on demand for outputs", kind)
+        task.set("SAMP_QUANT_SAMP_MODE", request.sample_mode_raw)
+        task.set("SAMP_QUANT_SAMP_PER_CHAN", request.samps_per_chan)
+        if kind == "Implicit":
+            return task.set("SAMP_TIMING_TYPE", constants.SampleTimingType.IMPLICIT.value)
+        task.set("SAMP_TIMING_TYPE", constants.SampleTimingType.SAMPLE_CLOCK.value)
+        task.set("SAMP_CLK_RATE", request.rate)
+        task.set("SAMP_CLK_SRC", request.source)
+        task.set("SAMP_CLK_ACTIVE_EDGE", request.active_edge_raw)
+        task.check_clock()
+        return None
+
+    @call("CfgInputBuffer")
+    def configure_buffer(self, request: Any, *_: Any) -> None:
+        """Set the size of the input buffer."""
+        self.task(request).set("INPUT_BUF_SIZE", request.num_samps_per_chan)
+
+    @call("Cfg(Dig|Anlg)Edge(Start|Ref)Trig")
+    def configure_trigger(self, request: Any, _: Any, __: Any, kind: str, which: str) -> None:
+        """Start at an edge, or acquire around it."""
+        task, which = self.task(request), which.upper()
+        prefix = f"{kind.upper()}_EDGE_{which}_TRIG"
+        task.set(f"{prefix}_SRC", request.trigger_source)
+        if kind == "Dig":
+            self._device.find_terminal(request.trigger_source)
+            task.set(f"{prefix}_EDGE", request.trigger_edge_raw)
+        else:
+            task.set(f"{prefix}_SLOPE", request.trigger_slope_raw)
+            task.set(f"{prefix}_LVL", request.trigger_level)
+        if which == "REF":
+            task.set("REF_TRIG_PRETRIG_SAMPLES", request.pretrigger_samples)
+        edge = TriggerType.DIGITAL_EDGE if kind == "Dig" else TriggerType.ANALOG_EDGE
+        task.set(f"{which}_TRIG_TYPE", edge.value)
+
+    @call("Disable(Start|Ref)Trig")
+    def disable_trigger(self, request: Any, _: Any, __: Any, which: str) -> None:
+        """Remove a trigger."""
+        self.task(request).set(f"{which.upper()}_TRIG_TYPE", TriggerType.NONE.value)
+
+    # ---- channels ----
+
+    @call("|".join(scaling.CALLS))
+    def add_analog_inputs(self, request: Any, _: Any, response: Any) -> None:
+        """Create analogue input channels."""
+        usage, prefix = scaling.CALLS[type(response).__name__.removesuffix("Response")]
+        physical, channels = self._device.expand(request.physical_channel, self._device.channels), []
+        for name, each in _name_channels(request.name_to_assign_to_channel, physical):
+            row = self._device.channel(each)
+            gain, offset = scaling.get_scale(request, row)
+            fixed = {
+                "AI_MEAS_TYPE": usage.value, f"{prefix}_UNITS": request.units_raw, "AI_RESOLUTION": float(row.adc_bits),
+                "AI_RAW_SAMP_SIZE": 16 if row.adc_bits <= 16 else 32,
+                "AI_RNG_HIGH": row.adc_v, "AI_RNG_LOW": -row.adc_v,
+                "AI_DEV_SCALING_COEFF": [0.0, row.lsb_v, 0.0, 0.0], "AI_LOWPASS_CUTOFF_FREQ": row.bandwidth_hz,
+                "AI_TERM_CFG": getattr(request, "terminal_config_raw", -1), "AI_CUSTOM_SCALE_NAME": "",
+                "AI_COUPLING": (constants.Coupling.AC if row.highpass_hz else constants.Coupling.DC).value,
+            }  # fmt: skip
+            settable = _get_limits("AI", request) | {"CHAN_DESCR": row.label}
+            kind = ChannelType.ANALOG_INPUT
+            channels.append(VirtualChannel(name, [each], kind, gain, offset, settable, fixed))
+        self.task(request).add(channels)
+
+    @call("|".join(counters.CALLS))
+    def add_counter(self, request: Any, _: Any, response: Any) -> None:
+        """Create the counter input channel."""
+        usage, edge = counters.CALLS[type(response).__name__.removesuffix("Response")]
+        physical = self._device.expand(request.counter, self._device.counters)
+        prefix = re.sub(r"_(ACTIVE|START|STARTING)_EDGE$", "", edge)
+        settable = {
+            f"{prefix}_TERM": list(self._device.terminals)[-1],
+            edge: getattr(request, "edge_raw", constants.Edge.RISING.value),
+        }
+        fixed: dict[str, Any] = {"CI_MEAS_TYPE": usage.value}
+        if usage is constants.UsageTypeCI.COUNT_EDGES:
+            settable["CI_COUNT_EDGES_INITIAL_CNT"] = request.initial_count
+            settable["CI_COUNT_EDGES_DIR"] = request.count_direction_raw
+        else:
+            if request.units_raw not in (constants.FrequencyUnits.HZ.value, constants.TimeUnits.SECONDS.value):
+                refuse_value("units", "Hz or seconds", request.units_raw)
+            settable |= _get_limits("CI", request)
+            fixed[f"{prefix}_UNITS"] = request.units_raw
+        name, kind = request.name_to_assign_to_channel or physical[0], ChannelType.COUNTER_INPUT
+        self.task(request).add([VirtualChannel(name, physical, kind, attributes=settable, fixed=fixed)])
+
+    @call("CreateAOVoltageChan")
+    def add_analog_output(self, request: Any, *_: Any) -> None:
+        """Create the analogue output channel."""
+        self._outputs.check()
+        physical, settable = self._device.expand(request.physical_channel, self._device.analog_outputs), {}
+        settable = _get_limits("AO", request)
+        name, kind = request.name_to_assign_to_channel or physical[0], ChannelType.ANALOG_OUTPUT
+        self.task(request).add([VirtualChannel(name, physical, kind, attributes=settable)])
+
+    @call("CreateD([IO])Chan")
+    def add_lines(self, request: Any, _: Any, __: Any, which: str) -> None:
+        """Create digital channels."""
+        kind, known = ChannelType.DIGITAL_INPUT, self._device.inputs | self._device.lines
+        if which == "O":
+            self._outputs.check()
+            kind, known = ChannelType.DIGITAL_OUTPUT, self._device.lines
+        lines, name = self._device.expand_lines(request.lines, known), request.name_to_assign_to_lines
+        groups = [(name or request.lines, lines)]
+        if request.line_grouping_raw == constants.LineGrouping.CHAN_PER_LINE.value:
+            groups = [(each, [line]) for each, line in _name_channels(name, lines)]
+        numbers = [{f"D{which}_NUM_LINES": len(group)} for _, group in groups]
+        self.task(request).add(
+            [VirtualChannel(*group, kind, fixed=fixed) for group, fixed in zip(groups, numbers, strict=True)]
+        )
+
+
+def _get_limits(prefix: str, request: Any) -> dict[str, Any]:
+    if not request.min_val < request.max_val:
+        detail = str(InputError("min_val", f"below max_val, {request.max_val:g}", request.min_val))
+        raise DaqmxError(Code.MIN_NOT_LESS_THAN_MAX, detail)
+    return {f"{prefix}_MIN": request.min_val, f"{prefix}_MAX": request.max_val}
+
+
+def _name_channels(given: str, physical: list[str]) -> list[tuple[str, str]]:
+    """Return names and physical channels: the given names, one numbered name, or the physical ones."""
+    names = unflatten_channel_string(given)
+    if len(names) != len(physical):
+        names = [f"{given}{number}" for number in range(len(physical))] if given else physical
+    return list(zip(names, physical, strict=True))

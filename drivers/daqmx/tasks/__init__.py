@@ -1,0 +1,1 @@
+"""Tasks of programs: configuration, acquisition and counters."""

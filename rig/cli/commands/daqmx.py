@@ -1,0 +1,55 @@
+"""`rig daqmx`: a running rig as a device of NI-DAQmx, over gRPC."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rig.base.errors import InputError, RefusedError
+from rig.base.text import printable
+from rig.cli.connections.connection import Connection
+from rig.cli.output.tables import echo
+from rig.cli.signals import stop_on_signals
+
+_PORT = 31763
+"""Port of NI's own server."""
+
+
+def daqmx(
+    *,
+    port: Annotated[int, typer.Option(metavar="NUMBER", help="Port on 127.0.0.1; 0: any free port")] = _PORT,
+    device: Annotated[
+        str, typer.Option(metavar="NAME", help="Name of the device in the program, such as Dev1")
+    ] = "rig",
+    allow_commands: Annotated[
+        bool, typer.Option("--allow-commands", help="Let digital and analog outputs command the rig")
+    ] = False,
+    connection: Connection,
+) -> None:
+    """Serve a running rig to programs that use nidaqmx, over gRPC, until Ctrl-C."""
+    import threading
+
+    from rig.serve.transport.endpoint import check_free, parse_loopback
+
+    if not (device.isascii() and device.replace("_", "").isalnum()):
+        raise InputError("--device", "letters, digits and _", printable(device))
+    address = f"127.0.0.1:{port}"
+    check_free(parse_loopback(address, field="--port", least=0), field="--port")
+    try:
+        from drivers.daqmx.server import DaqmxServer
+    except ModuleNotFoundError as error:
+        raise RefusedError(f"rig daqmx needs {error.name}: pip install 'rotor-stator-rig[nidaqmx]'") from None
+    done = threading.Event()
+    with (
+        connection.client() as client,
+        DaqmxServer(client, port=port, device=device, allow_commands=allow_commands) as server,
+    ):
+        for physical, channel in server.device.channels.items():
+            row = server.device.table.channels[channel]
+            echo(f"{physical:14s}{channel:12s}{row.unit}")
+        for terminal, signal in server.device.terminals.items():
+            echo(f"{terminal:14s}{signal.channel}")
+        echo(f"rig: NI-DAQmx device {device} at 127.0.0.1:{server.port}; Ctrl-C ends it", err=True)
+        with stop_on_signals(done.set):
+            done.wait()
