@@ -53,6 +53,7 @@ COMMANDS = {
         "twins": "Serve the simulated instruments of a running rig",
         "daqmx": "Serve a running rig to programs that use nidaqmx, over gRPC",
         "can": "Run virtual CAN buses, and list the CAN messages of the rig",
+        "modbus": "Serve a running rig to Modbus TCP clients as a protection rack",
     },
     "Replay a recording": {
         "replay": "Publish a recording as a running rig would",

@@ -43,6 +43,7 @@ _READY = {
     "record": "rig: recording",
     "twins": "Ctrl-C ends",
     "daqmx": "Ctrl-C ends",
+    "modbus": "Ctrl-C ends",
     "view": "Ctrl-C ends",
     "-m": "Connected to",  # python -m can.logger
     "plain_device.py": "joined",

@@ -105,7 +105,7 @@ LEAN_ARGUMENTS = {
     "keys init": "{folder}/keys --host 127.0.0.1 --keep-authority", "keys add": "{folder}/keys daq1",
     "keys remove": "{folder}/keys daq1", "completion": "bash", "hammer": "-h", "speed": "-h", "release": "-h",
     "fault": "-h", "stop": "-h", "step": "-h", "status": "-h", "note": "-h", "twins": "-h", "daqmx": "-h",
-    "record": "-h",
+    "modbus": "--map", "record": "-h",
     "replay": "-h", "pause": "-h", "resume": "-h", "seek": "-h", "rate": "-h",
 }  # fmt: skip
 """Commands that docs/install.md promises without extras; for those of a running rig only the help is called."""
