@@ -230,6 +230,18 @@ def test_start_trigger_waits_for_the_hammer(rig: PlayedRig, task: nidaqmx.Task) 
     np.testing.assert_allclose(got, counts(2, 3)[77 : 77 + 200 : 10, 0], atol=1e-6)
 
 
+def test_retriggered_task_acquires_after_each_impact(rig: PlayedRig, task: nidaqmx.Task) -> None:
+    task.ai_channels.add_ai_voltage_chan("rig/ai0")
+    task.timing.cfg_samp_clk_timing(10_000.0, samps_per_chan=50)
+    task.triggers.start_trigger.cfg_anlg_edge_start_trig("rig/ai14", trigger_level=0.1)  # 44 N
+    task.triggers.start_trigger.retriggerable = True
+    task.start()
+    rig.send(0, 1, 2, hammer=pulses("hammer", 600, 30, 90, 180, 410))
+    got = np.array(task.read(150)) / TABLE.channels["disk_x"].lsb_v
+    rows = np.concatenate([np.arange(begin, begin + 100, 2) for begin in (30, 180, 410)])
+    np.testing.assert_allclose(got, counts(0, 1, 2)[rows, 0], atol=1e-6)
+
+
 @pytest.mark.parametrize("digital", [True, False])
 def test_reference_trigger_keeps_the_samples_before_it(rig: PlayedRig, task: nidaqmx.Task, digital: bool) -> None:
     task.ai_channels.add_ai_voltage_chan("rig/ai0:1")
@@ -282,6 +294,16 @@ def test_digital_inputs_are_the_signals_of_the_rig(rig: PlayedRig, task: nidaqmx
     rig.send(0, hammer=pulses("hammer", ROWS, 50), keyphasor=pulses("keyphasor", ROWS, 150))
     hammer, keyphasor = np.array(task.read(ROWS))
     assert (np.flatnonzero(hammer)[[0, -1]].tolist(), np.flatnonzero(keyphasor)[0]) == ([50, 54], 150)
+
+
+def test_clocked_lines_of_outputs_wait_for_the_clock(rig: PlayedRig, task: nidaqmx.Task) -> None:
+    task.di_channels.add_di_chan("rig/port0", line_grouping=LineGrouping.CHAN_FOR_ALL_LINES)
+    task.timing.cfg_samp_clk_timing(20_000.0, samps_per_chan=ROWS)
+    task.start()
+    with pytest.raises(nidaqmx.errors.DaqReadError, match="-200284"):
+        task.read(ROWS, timeout=0.0)
+    rig.send(0)
+    assert task.read(ROWS) == [0] * ROWS
 
 
 def test_outputs_are_refused_unless_commands_are_allowed(rig: PlayedRig, task: nidaqmx.Task) -> None:
@@ -337,6 +359,8 @@ def test_wrong_settings_are_refused_with_the_codes_of_the_vendor(
         task.triggers.start_trigger.cfg_dig_edge_start_trig("/rig/PFI3")
     with refused(DAQmxErrors.ATTRIBUTE_NOT_SUPPORTED_IN_TASK_CONTEXT):
         task.in_stream.overcurrent_chans_exist  # noqa: B018
+    with refused(DAQmxErrors.INVALID_RANGE_OF_OBJECTS_SYNTAX_IN_STRING):
+        task.ai_channels.add_ai_voltage_chan("rig/ai:x")
     task.timing.cfg_samp_clk_timing(20_000.0, samps_per_chan=1 << 40)
     with refused(DAQmxErrors.PAL_MEMORY_FULL):
         task.start()

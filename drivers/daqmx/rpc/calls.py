@@ -10,9 +10,10 @@ from typing import Any, NoReturn, TypeVar
 import grpc
 from nidaqmx._stubs import nidaqmx_pb2  # noqa: PLC2701
 from nidaqmx._stubs.nidaqmx_pb2_grpc import NiDAQmxServicer  # noqa: PLC2701
+from nidaqmx.errors import DaqError
 
 from drivers.daqmx.hardware.errors import Code, DaqmxError
-from rig.base.errors import InputError, RefusedError
+from rig.base.errors import RefusedError
 
 CHECKED_VERSION = "1.7.0"
 """Version of the package whose private messages were checked."""
@@ -50,7 +51,7 @@ def _respond(method: Any, response: str, groups: tuple[str, ...], request: Any, 
     result = getattr(nidaqmx_pb2, response)()
     try:
         method(request, context, result, *groups)
-    except (DaqmxError, InputError, RefusedError, ConnectionError, EOFError) as error:
+    except (DaqmxError, DaqError, ValueError, RefusedError, ConnectionError, EOFError) as error:
         _abort(context, request, error)
     return result
 
@@ -64,8 +65,10 @@ def _stream(method: Any, response: str, groups: tuple[str, ...], request: Any, c
 
 def _abort(context: Any, request: Any, error: Exception) -> NoReturn:
     """End a call with an error, in the metadata that the package reads."""
-    if isinstance(error, InputError | RefusedError):
+    if isinstance(error, ValueError | RefusedError):
         error = DaqmxError(Code.INVALID_ATTRIBUTE_VALUE, str(error))
+    elif isinstance(error, DaqError):  # of the package's parser of channel lists
+        error = DaqmxError(Code(error.error_code), "channels as in rig/ai0:3, rig/ai7")
     elif not isinstance(error, DaqmxError):
         error = DaqmxError(Code.DEV_CANNOT_BE_ACCESSED, str(error))
     task = request.task.name if hasattr(request, "task") else ""

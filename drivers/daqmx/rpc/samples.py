@@ -94,7 +94,7 @@ class DaqmxServicer(Properties):
         task, count, columns = self.task(request), 1, {}
         _check_kind(task, ChannelType.DIGITAL_INPUT, ChannelType.DIGITAL_OUTPUT)
         lines, device = [channel.physical for channel in task.channels], self._device
-        if any(line in device.inputs for group in lines for line in group):
+        if task.plan()[0]:
             wanted = 1 if kind == "ScalarU32" else request.num_samps_per_chan
             samples, status = task.read(wanted, request.timeout, context.is_active)
             count, columns = len(samples), dict(zip(samples.names, samples.values.T, strict=True))

@@ -26,7 +26,7 @@ from drivers.sources.stream import decimation_factor
 from rig.base.errors import InputError
 from rig.channels.table import Channel
 
-_MAX_BUFFER = 1 << 25
+MAX_BUFFER = 1 << 25
 """Largest number of samples of all channels in a buffer, 128 MB."""
 
 
@@ -159,18 +159,19 @@ class Configuration:
         finite, size = mode == AcquisitionType.FINITE.value, settings["SAMP_QUANT_SAMP_PER_CHAN"]
         if mode not in (AcquisitionType.FINITE.value, AcquisitionType.CONTINUOUS.value):
             refuse_value("SAMP_QUANT_SAMP_MODE", "finite or continuous", mode)
-        buffer = settings["INPUT_BUF_SIZE"] or (size if finite else get_buffer_size(wanted_hz, size))
+        retrigger = settings["START_TRIG_RETRIGGERABLE"] and finite and triggers["START"] is not None
+        endless = retrigger or not finite
+        buffer = settings["INPUT_BUF_SIZE"] or (get_buffer_size(wanted_hz, size) if endless else size)
         buffer = max(buffer, size if finite else 1)
-        if buffer * len(names) > _MAX_BUFFER or size < 1:
-            detail = f"a buffer of {buffer} samples of {len(names)} channels; at most {_MAX_BUFFER} together"
+        if buffer * len(names) > MAX_BUFFER or size < 1:
+            detail = f"a buffer of {buffer} samples of {len(names)} channels; at most {MAX_BUFFER} together"
             raise DaqmxError(Code.PAL_MEMORY_FULL, detail)
         pretrigger = settings["REF_TRIG_PRETRIG_SAMPLES"]
         if triggers["REF"] is not None and not (finite and 2 <= pretrigger < size):
             refuse_value("REF_TRIG_PRETRIG_SAMPLES", "from 2 to below the samples of a finite acquisition", pretrigger)
         return names, rate_hz, Plan(
             columns, step=step, keep=size if finite else None, max_rows=buffer, start=triggers["START"],
-            reference=triggers["REF"], pretrigger=pretrigger, measure=measure,
-            retrigger=settings["START_TRIG_RETRIGGERABLE"] and finite and triggers["START"] is not None,
+            reference=triggers["REF"], pretrigger=pretrigger, measure=measure, retrigger=retrigger,
         )  # fmt: skip
 
     def check_clock(self, native_hz: float | None = None) -> int:
@@ -200,7 +201,8 @@ class Configuration:
         if self.kind is ChannelType.DIGITAL_INPUT:
             lines = [line for channel in self.channels for line in channel.physical]
             found = [self.device.inputs[line].channel for line in lines if line in self.device.inputs]
-            return list(dict.fromkeys(found))
+            clocked = self.settings["SAMP_TIMING_TYPE"] == SampleTimingType.SAMPLE_CLOCK.value
+            return list(dict.fromkeys(found or list(self.device.channels.values())[:clocked]))
         return []
 
     def _find_signal(self) -> Terminal:

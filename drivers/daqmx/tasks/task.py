@@ -15,7 +15,7 @@ from nidaqmx.constants import (
 from drivers.daqmx.hardware.device import Device
 from drivers.daqmx.hardware.errors import Code, DaqmxError
 from drivers.daqmx.tasks.acquisition import Acquisition, Plan
-from drivers.daqmx.tasks.configuration import Configuration
+from drivers.daqmx.tasks.configuration import MAX_BUFFER, Configuration
 from drivers.daqmx.tasks.counters import Counter
 from drivers.link import LinkTimeoutError
 from drivers.sources import Source
@@ -130,6 +130,8 @@ class Task(Configuration):
         """
         if self.kind not in (ChannelType.ANALOG_INPUT, ChannelType.COUNTER_INPUT, ChannelType.DIGITAL_INPUT):
             raise DaqmxError(Code.READ_NO_INPUT_CHANS_IN_TASK, "the task has outputs only")
+        if count * len(self.channels) > MAX_BUFFER:
+            raise DaqmxError(Code.PAL_MEMORY_FULL, f"{count} samples of {len(self.channels)} channels in one read")
         automatic = not self.started
         if automatic:
             if not self.settings["AUTO_START"]:
