@@ -9,6 +9,7 @@ import random
 import struct
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -97,12 +98,14 @@ def test_registers_equal_the_detectors_of_a_recording(session: Samples) -> None:
 
 def test_contents_do_not_depend_on_the_blocks(session: Samples) -> None:
     whole, parts = Contents(REGISTERS, SETTINGS), Contents(REGISTERS, SETTINGS)
-    whole.feed(session)
+    end = len(session) - round(0.025 * session.rate_hz)
+    whole.feed(session.rows(0, end))
     draw, at = np.random.default_rng(3), 0
-    while at < len(session):
+    while at < end:
         step = int(draw.integers(1, 900))
-        parts.feed(session.rows(at, min(at + step, len(session))))
+        parts.feed(session.rows(at, min(at + step, end)))
         at += step
+    assert whole.values[0] == pytest.approx(0.5)
     assert whole.bits == parts.bits
     assert np.array_equal(whole.values, parts.values)
 
@@ -122,6 +125,15 @@ def test_a_channel_at_its_limit_is_not_ok_and_missing_rows_clear_all_bits(sessio
     late = session.rows(100, 200)
     contents.feed(replace(late, index=10**6, tick=2 * 10**8))
     assert not any(contents.bits)
+
+
+def test_a_channel_is_ok_again_after_a_window_and_a_probe_after_the_recovery_of_the_monitor(session: Samples) -> None:
+    values = session.values.copy()
+    values[100:150, session.names.index("P_N")] = 9_900.0
+    values[100:150, session.names.index("disk_x")] = 2.03
+    contents = Contents(REGISTERS, SETTINGS)
+    contents.feed(replace(session, values=values))
+    assert [bits_of(contents, name)["OK"] for name in ("P_N", "disk_x", "disk_y")] == [True, False, True]
 
 
 def test_alarm_bits_are_those_of_the_monitor() -> None:
@@ -277,6 +289,26 @@ def test_requests_sent_before_the_reply_are_answered_in_order() -> None:
         replies = [client.receive(number, 4) for number in range(20)]
     words, _ = REGISTERS.encode(np.arange(58.0))
     assert [int.from_bytes(reply[1:], "big") for reply in replies] == words[:20]
+
+
+def test_a_request_waits_for_the_command_before_it() -> None:
+    done = threading.Event()
+    with served(lambda _: done.wait(60.0)) as (port, _), ModbusClient(port) as client, ModbusClient(port) as other:
+        client.link.sendall(struct.pack(">HHHBBHH", 1, 0, 6, 17, 5, 0, 0xFF00))
+        for _ in range(5):
+            other.registers(0, 1)  # the server continues
+        client.link.sendall(struct.pack(">HHHBBHH", 2, 0, 6, 17, 4, 0, 1))
+        for _ in range(5):
+            other.registers(0, 1)
+        done.set()
+        assert client.receive(1, 5) == struct.pack(">HH", 0, 0xFF00)
+        assert client.receive(2, 4) == b"\2\0\0"
+
+
+def test_a_message_of_another_protocol_closes_its_connection() -> None:
+    with served() as (port, _), ModbusClient(port) as client:
+        client.link.sendall(struct.pack(">HHHBBHH", 1, 1, 6, 17, 4, 0, 1))
+        assert client.link.recv(1) == b""
 
 
 def test_values_out_of_range_are_limited_and_those_that_are_not_numbers_are_zero() -> None:
