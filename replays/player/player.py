@@ -68,6 +68,7 @@ class Player(ServedRun):
         paused: Wait for `resume`, `step` or `seek` before publishing.
         wait_for: Number of acknowledging clients to wait for before publishing; `resume` and `pause` end the wait.
         wait_s: Longest wait for these clients before an error [s].
+        hold: Pause at the end of the recording, so that a client can seek back, instead of ending the replay.
         linger_s: Longest time at the end for clients to recover missing blocks [s].
 
     Raises:
@@ -88,6 +89,7 @@ class Player(ServedRun):
         paused: bool = False,
         wait_for: int = 0,
         wait_s: float = 60.0,
+        hold: bool = False,
         linger_s: float = 10.0,
     ) -> None:
         documents = track.documents
@@ -120,6 +122,7 @@ class Player(ServedRun):
         self._awaited = wait_for
         """Number of clients to wait for; 0 if only a command ends the pause."""
         self._wait_s = wait_s
+        self._hold = hold
         self._step: _PlayStep | None = None
         self._held: tuple[str, float] | None = None
         """Client that limits a burst, and the time since when it does [s, monotonic]."""
@@ -244,7 +247,11 @@ class Player(ServedRun):
             if self._head is None:
                 self._head = self._ahead.take(_POLL_S)
                 if self._head is None and self._ahead.ended:
-                    return "completed"
+                    if not self._hold:
+                        return "completed"
+                    self._cancel_step("the end of the recording")
+                    self._paused = True
+                    self._playhead.hold(self._now_ns())
             if isinstance(self._head, Mark):
                 if self._burst and self._begun and self._handler.clients.max_lag_rows(self.published):
                     # Row numbers may step back: clients must first acknowledge the earlier rows.

@@ -52,6 +52,7 @@ COMMANDS = {
         "stop": "End the run of a rig and close its recordings",
         "twins": "Serve the simulated instruments of a running rig",
         "daqmx": "Serve a running rig to programs that use nidaqmx, over gRPC",
+        "foxglove": "Serve a running rig, or a recording, to the Foxglove app",
         "can": "Run virtual CAN buses, and list the CAN messages of the rig",
         "modbus": "Serve a running rig to Modbus TCP clients as a protection rack",
     },

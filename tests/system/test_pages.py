@@ -33,8 +33,8 @@ pytestmark = pytest.mark.wallclock
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = [*PAGES, ROOT / "CONTRIBUTING.md"]
-PORTS = (7460, 7461, 7462, 7463, 31763)
-"""Ports of the pages' rig, bus, instruments and NI-DAQmx device."""
+PORTS = (7460, 7461, 7462, 7463, 8765, 31763)
+"""Ports of the pages' rig, bus, instruments, Foxglove server and NI-DAQmx device."""
 _RUNS_LONG_BLOCKS = bool(os.environ.get("RIG_LONG_PAGES"))
 _BLOCK = re.compile(r"(?:^<!-- ([^\n]*) -->\n)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _READY = {
@@ -42,6 +42,7 @@ _READY = {
     "replay": "listening on",
     "record": "rig: recording",
     "twins": "Ctrl-C ends",
+    "foxglove": "Ctrl-C ends",
     "daqmx": "Ctrl-C ends",
     "modbus": "Ctrl-C ends",
     "view": "Ctrl-C ends",
