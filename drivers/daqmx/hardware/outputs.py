@@ -12,6 +12,10 @@ from drivers.daqmx.hardware.errors import Code, DaqmxError
 from rig.base.errors import InputError, RefusedError
 from rig.channels.table import Channel
 
+_ACTIONS: dict[str, Callable[[Console], Any]] = {
+    "hit": Console.hammer, "stop": lambda console: console.speed(0.0), "trip": Console.stop, "release": Console.release,
+}  # fmt: skip
+
 
 class Outputs:
     """States of the outputs, shared by all tasks.
@@ -50,7 +54,7 @@ class Outputs:
             for number, state in states.items():
                 rises, self.lines[number] = state and not self.lines[number], state
                 if rises:
-                    self._send(OUTPUT_LINES[number])
+                    self._command(_ACTIONS[OUTPUT_LINES[number]])
 
     def set_volts(self, volts: float) -> None:
         """Set the speed set point by its voltage, on the scale of the speed channel.
@@ -63,15 +67,6 @@ class Outputs:
         hertz = (volts - self._speed.bias_v) / self._speed.sensitivity_v
         with self._lock:
             self._command(lambda console: console.speed(hertz))
-
-    def _send(self, action: str) -> None:
-        actions: dict[str, Callable[[Console], Any]] = {
-            "hit": Console.hammer,
-            "stop": lambda console: console.speed(0.0),
-            "trip": Console.stop,
-            "release": Console.release,
-        }
-        self._command(actions[action])
 
     def _command(self, command: Callable[[Console], Any]) -> None:
         assert self._console is not None

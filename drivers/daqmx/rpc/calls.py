@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 import grpc
 from nidaqmx._stubs import nidaqmx_pb2  # noqa: PLC2701
@@ -17,18 +17,17 @@ from rig.base.errors import RefusedError
 
 CHECKED_VERSION = "1.7.0"
 """Version of the package whose private messages were checked."""
-_Method = TypeVar("_Method", bound=Callable[..., Any])
 
 
-def call(pattern: str) -> Callable[[_Method], _Method]:
+def call(pattern: str) -> Callable[[Any], Any]:
     """Make a method handle the calls of a pattern; it gets request, context, response and the groups of the pattern.
 
     Args:
         pattern: Regular expression of whole names. A generator handles calls with several responses.
     """
 
-    def mark(method: _Method) -> _Method:
-        method.pattern = re.compile(pattern)  # type: ignore[attr-defined]
+    def mark(method: Any) -> Any:
+        method.pattern = re.compile(pattern)
         return method
 
     return mark

@@ -19,6 +19,9 @@ _KINDS = {
     "Counter": ChannelType.COUNTER_INPUT, "Ctr": ChannelType.COUNTER_INPUT,
 }  # fmt: skip
 
+_PIECE = 1 << 16
+"""Values that are Python objects at a time: they need four times the memory."""
+
 
 class DaqmxServicer(Properties):
     """All calls that the device supports."""
@@ -54,7 +57,8 @@ class DaqmxServicer(Properties):
         response.status, response.samps_per_chan_read = status, len(values)
         arrays = values.reshape(-1, width).T if family == "Ctr" else [_fill(values.reshape(-1, width), request)]
         for name, array in zip(fields, arrays, strict=True):
-            getattr(response, name).extend(array.tolist())
+            for begin in range(0, len(array), _PIECE):
+                getattr(response, name).extend(array[begin : begin + _PIECE].tolist())
 
     @call("ReadAnalogWaveforms")
     def read_waveforms(self, request: Any, context: Any, response: Any) -> None:

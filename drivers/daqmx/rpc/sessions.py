@@ -140,11 +140,6 @@ class Sessions(Calls):
         task.check_clock()
         return None
 
-    @call("CfgInputBuffer")
-    def configure_buffer(self, request: Any, *_: Any) -> None:
-        """Set the size of the input buffer."""
-        self.task(request).set("INPUT_BUF_SIZE", request.num_samps_per_chan)
-
     @call("Cfg(Dig|Anlg)Edge(Start|Ref)Trig")
     def configure_trigger(self, request: Any, _: Any, __: Any, kind: str, which: str) -> None:
         """Start at an edge, or acquire around it."""
@@ -216,7 +211,7 @@ class Sessions(Calls):
     def add_analog_output(self, request: Any, *_: Any) -> None:
         """Create the analogue output channel."""
         self._outputs.check()
-        physical, settable = self._device.expand(request.physical_channel, self._device.analog_outputs), {}
+        physical = self._device.expand(request.physical_channel, self._device.analog_outputs)
         settable = _get_limits("AO", request)
         name, kind = request.name_to_assign_to_channel or physical[0], ChannelType.ANALOG_OUTPUT
         self.task(request).add([VirtualChannel(name, physical, kind, attributes=settable)])
