@@ -197,19 +197,16 @@ class FoxgloveServer(Closing):
         scene = wire.decode_document(self._client.request(wire.SCENE))
         catalogue = Catalogue.read(document)
         self._groups = {wire.sensor_key(name): group for name, group in catalogue.table.groups.items()}
-        self._table, self._tick_rate_hz = catalogue.table, catalogue.tick_rate_hz
+        self._tick_rate_hz = round(catalogue.tick_rate_hz)
         self._validator, self._rows = BlockValidator(catalogue), wire.Continuity()
         self._scene = _flatten(scene.get("scene") if isinstance(scene.get("scene"), dict) else scene)
-        self._start_views()
+        self._views = Views(catalogue.table, rate_hz=self._view_rate_hz)
         if document != self._catalogue:
             self._catalogue = document
             for channel in self._channels.values():
                 channel.close()
             self._channels = {view.topic: self._open_channel(view.topic, JOINT_STATE) for view in self._views.all}
             self._channels[VIEW_EVENTS] = self._open_channel(VIEW_EVENTS, LOG)
-
-    def _start_views(self) -> None:
-        self._views, self._runs = Views(self._table, rate_hz=self._view_rate_hz), 0
 
     def _open_channel(self, topic: str, form: Definition) -> Channel:
         from foxglove import Channel, Schema
@@ -222,11 +219,7 @@ class FoxgloveServer(Closing):
             if (group := self._groups.get(key)) is None:
                 continue
             self._rows.follow(key, block.index, len(block.values))
-            if (runs := self._rows.runs[key]) > self._runs:
-                # After a jump back, rows that still wait for another group would follow later ones.
-                self._start_views()
-                self._runs = runs
-            start_ns = block.tick * _NS // round(self._tick_rate_hz)
+            start_ns = block.tick * _NS // self._tick_rate_hz
             self._now_ns = start_ns + round((len(block.values) - 1) * _NS / block.rate_hz)
             if (plotted := self._views.add(group, block, start_ns)) is not None:
                 self._log(*plotted)
@@ -234,7 +227,7 @@ class FoxgloveServer(Closing):
     def _take_event(self, payload: bytes) -> None:
         event = parse_event(payload)
         tick = event.get("tick")
-        time_ns = self._now_ns if tick is None else tick * _NS // round(self._tick_rate_hz)
+        time_ns = self._now_ns if tick is None else tick * _NS // self._tick_rate_hz
         level, text = event_text(event)
         self._publish(VIEW_EVENTS, encode_log(time_ns, level, wire.EVENTS, text), time_ns)
 

@@ -32,7 +32,7 @@ BUDGETS = {
     "recorder": 1358,
     "recorder/contents": 1268,
     "recorder/files": 831,
-    "recorder/foxglove": 316,
+    "recorder/foxglove": 311,
     "recorder/output": 544,
     "recorder/viewer": 1928,
     "replays": 0,

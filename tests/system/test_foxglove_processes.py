@@ -46,8 +46,8 @@ def test_a_command_reaches_the_rig_and_a_restart_continues_the_streams() -> None
                     read_line(second, "listening on")
                     client.until(lambda: len(client.find("serverInfo")) > sessions)
                     client.messages.clear()
-                    again = client.call("hammer", {})
-                    assert again["id"] == 1  # the first command of another run
+                    again = client.call("speed", {"speed_hz": 6.0})
+                    assert again.get("id") == 1, again  # the first command of another run
                     client.until(lambda: any(row[0] > 1000 * again["tick"] for row in client.messages.get(PLOTS, ())))
                     assert client.call("stop", {})["op"] == "reply"
             for child in (server, reader):
