@@ -17,7 +17,7 @@ from recorder.reader import Recording
 from replays.estimate.spectra import NoiseSpectrum, whiten_rows
 from replays.recordings.resimulation.experiment import Experiment
 from rig.base.errors import InputError
-from rig.channels.formula import Formulas
+from rig.channels.formula import COLUMN, Formulas
 from rig.channels.sampling import has_few_positions, lagrange, sample_spacing
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.sensors.filters import delay_s
@@ -233,6 +233,10 @@ def read_measured(recording: Recording, scene: Scene, *, longest_s: float = math
     return parts
 
 
+_SPEEDS = [COLUMN[name] for name in ("vx_ih", "vy_ih", "vx_oh", "vy_oh")]
+_ACCELERATIONS = [COLUMN[name] for name in ("inner_ax", "inner_ay", "outer_ax", "outer_ay")]
+
+
 @dataclass(frozen=True)
 class Prediction:
     """Predicted channels and truth.
@@ -261,9 +265,21 @@ class _Channels:
     """Conversion of model rows to noise-free channels of one rate, on the recorded rows."""
 
     def __init__(
-        self, parts: Sequence[Measured], *, rate_hz: int, row_rate_hz: int, formulas: Formulas, digital: bool
-    ) -> None:
-        self._parts, self._rate_hz = parts, rate_hz
+        self, parts: Sequence[Measured], *, rate_hz: int, row_rate_hz: int, formulas: Formulas, digital: bool,
+        from_speeds: bool = False,
+    ) -> None:  # fmt: skip
+        """Set up the conversion.
+
+        Args:
+            parts: Channels of one rate.
+            rate_hz: Samples per second [Hz].
+            row_rate_hz: Rows of the model per second [Hz].
+            formulas: Formulas of the scene.
+            digital: Whether the filters are those of tables of version 1.
+            from_speeds: Whether accelerations of the houses are derived from their speeds: friction that changes its
+                sign between two rows makes a step in an acceleration, which its values at the rows do not locate.
+        """
+        self._parts, self._rate_hz, self._row_rate_hz = parts, rate_hz, row_rate_hz
         self.apart, self._in_a_row = sample_spacing(rate_hz, row_rate_hz)
         # A compensated filter needs later rows: it is computed with a delay of whole samples, which is then removed.
         self._leads = {part.group: [math.ceil(lead_s(channel) * rate_hz) for channel in part.fine] for part in parts}
@@ -280,7 +296,8 @@ class _Channels:
             groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal, digital=digital,
             columns=formulas.columns(groups),
         )  # fmt: skip
-        self._formulas, self._last = formulas, np.empty((0, 0))
+        self._formulas, self._last, self._rows = formulas, np.empty((0, 0)), np.empty((0, 0))
+        self._from_speeds = from_speeds
         self._counts: dict[str, list[np.ndarray]] = {part.group: [] for part in parts}
         self._first = 0
 
@@ -289,6 +306,23 @@ class _Channels:
         self._first = row * self._in_a_row // self.apart
 
     def take(self, rows: np.ndarray) -> None:
+        if self._from_speeds:
+            rows = self._differentiate(rows)
+        if len(rows):
+            self._convert(rows)
+
+    def _differentiate(self, rows: np.ndarray) -> np.ndarray:
+        """Return the rows up to the last but two, with accelerations of the houses derived from their speeds."""
+        rows = np.concatenate([self._rows, rows]) if len(self._rows) else rows
+        self._rows, smooth = rows[-4:].copy(), rows[:-2].copy()
+        if len(rows) < 5:
+            self._rows = rows
+            return rows[:0]
+        v = rows[:, _SPEEDS]
+        smooth[2:, _ACCELERATIONS] = (8.0 * (v[3:-1] - v[1:-3]) - v[4:] + v[:-4]) * (self._row_rate_hz / 12.0)
+        return smooth[2:] if len(self._last) else smooth
+
+    def _convert(self, rows: np.ndarray) -> None:
         if len(self._last):
             rows = np.concatenate([self._last, rows])
         self._last = rows[-1:].copy()
@@ -296,7 +330,7 @@ class _Channels:
             self._counts[name].append(counts)
 
     def values(self) -> dict[str, np.ndarray]:
-        self.take(self._last)  # for the sample on the last row
+        self._convert(self._last)  # for the sample on the last row
         values_by_group = {}
         for part in self._parts:
             values = self._groups[part.group].engineering(np.concatenate(self._counts[part.group]))
@@ -342,7 +376,9 @@ def interpolate_rows(values: np.ndarray, places: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> list[_Channels]:
+def _channels(
+    parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int, from_speeds: bool = False
+) -> list[_Channels]:
     """Return the channels, grouped by rate."""
     rates: dict[tuple[int, bool], list[Measured]] = {}
     for part in parts.values():
@@ -354,7 +390,14 @@ def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> 
         # At a rate that does not divide the model's, channels are interpolated between all rows of the model.
         rates.setdefault((rate if exact else row_rate_hz, part.ideal), []).append(part)
     return [
-        _Channels(alike, rate_hz=rate, row_rate_hz=row_rate_hz, formulas=scene.formulas(), digital=alike[0].version < 2)
+        _Channels(
+            alike,
+            rate_hz=rate,
+            row_rate_hz=row_rate_hz,
+            formulas=scene.formulas(),
+            digital=alike[0].version < 2,
+            from_speeds=from_speeds,
+        )  # fmt: skip
         for (rate, _), alike in rates.items()
     ]
 
@@ -432,7 +475,7 @@ def predict(
                 follow(frame)
         return Prediction({name: _test_signals(experiment.scene, part) for name, part in parts.items()}, {}, 1)
     row_rate_hz, begin_s = TICK_RATE_HZ // simulation.row_ticks, simulation.tick / TICK_RATE_HZ
-    taking = _channels(parts, experiment.scene, row_rate_hz=row_rate_hz)
+    taking = _channels(parts, experiment.scene, row_rate_hz=row_rate_hz, from_speeds=experiment.imported)
     chunk_s = min(_CHUNK_S, last_s + 2e-3)  # includes the row of the last sample and some after it
     begin_tick = max(simulation.tick, _begin_tick(parts, taking, chunk_s=chunk_s, row_rate_hz=row_rate_hz))
     for channels in taking:
