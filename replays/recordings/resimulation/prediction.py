@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -389,15 +389,9 @@ def _channels(
         exact = even and bool(np.abs(places - np.rint(places)).max() < 1e-6)
         # At a rate that does not divide the model's, channels are interpolated between all rows of the model.
         rates.setdefault((rate if exact else row_rate_hz, part.ideal), []).append(part)
+    make = partial(_Channels, row_rate_hz=row_rate_hz, from_speeds=from_speeds)
     return [
-        _Channels(
-            alike,
-            rate_hz=rate,
-            row_rate_hz=row_rate_hz,
-            formulas=scene.formulas(),
-            digital=alike[0].version < 2,
-            from_speeds=from_speeds,
-        )  # fmt: skip
+        make(alike, rate_hz=rate, formulas=scene.formulas(), digital=alike[0].version < 2)
         for (rate, _), alike in rates.items()
     ]
 

@@ -351,12 +351,20 @@ def _resimulate_log(
     more: tuple[str, ...] = (),
 ) -> _Resimulation:
     """Return the re-simulation of a log: unknown numbers are fitted, and their uncertainty is added to the floor."""
-    rules = criteria.imported
-    tuned = tune(
-        recording, experiment, (*rules.nuisances, *more), priors=dict.fromkeys(criteria.floating), late_s=late_s,
-        progress=lambda text: step(f"log: {text}"),
-    )  # fmt: skip
-    whole, longest_s = read_measured(recording, tuned.baseline.scene), criteria.window.longest_s
+    rules, longest_s = criteria.imported, criteria.window.longest_s
+
+    def fit(until_s: float | None = None) -> list[Tuned]:
+        tuned = tune(
+            recording, experiment, (*rules.nuisances, *more), priors=dict.fromkeys(criteria.floating), late_s=late_s,
+            to_s=until_s, progress=lambda text: step(f"log: {text}"),
+        )  # fmt: skip
+        return [tuned, *(tuned.with_changes(variant.set) for variant in rules.variants)]
+
+    models = fit()
+    whole = read_measured(recording, models[0].baseline.scene)
+    if (parted_s := _find_parting(models, whole)) is not None:
+        models = fit(parted_s)  # later samples must not bend the motion before it
+    tuned = models[0]
     begin_s = window_start_s(tuned.baseline)
     parts = {
         name: part.select_until(float(part.times_s[0]) + longest_s).select_from(begin_s) for name, part in whole.items()
@@ -365,7 +373,6 @@ def _resimulate_log(
     step("perturbed, and with equally valid models, to find the predictable part")
     parts = {name: part.with_spectra(tuned.spectra) for name, part in parts.items()}
     uncertainties = [Uncertainty("fit", tuned.undo_last_growth().predict(parts))]
-    models = [tuned, *(tuned.with_changes(variant.set) for variant in rules.variants)]
     uncertainties += [
         Uncertainty(", ".join(f"{key} = {value}" for key, value in variant.set.items()), model.predict(parts))
         for variant, model in zip(rules.variants, models[1:], strict=True)
@@ -393,6 +400,18 @@ def _resimulate_log(
         parts=tuned.to_model_clock(parts),
         nominal=nominal, uncertainties=tuple(uncertainties), bits={}, tuned=tuned,
     )  # fmt: skip
+
+
+def _find_parting(models: Sequence[Tuned], whole: dict[str, Measured]) -> float | None:
+    """Return the time within the fit from which equally valid models differ [s]; None if there is no such time."""
+    tuned = models[0]
+    begin_s = max(window_start_s(tuned.baseline), first_command_s(tuned.baseline) - _CONTACT_MARGIN_S)
+    parts = {
+        name: part.select_from(begin_s).select_until(tuned.end_s).with_spectra(tuned.spectra)
+        for name, part in whole.items()
+    }
+    nominal, *others = (model.predict(parts) for model in models)
+    return foreseeable_s(parts, nominal, others, share=1.0)
 
 
 def _replace_pulses(

@@ -96,7 +96,7 @@ def foreseeable_s(
     ends = []
     for name, part in parts.items():
         for other in others:
-            apart = np.abs(other.values[name] - nominal.values[name]) > share * part.floor
+            apart = np.abs(part.whiten(other.values[name] - nominal.values[name])) > share * part.floor
             apart[:, [channel.name == "keyphasor" for channel in part.channels]] = False  # a pulse may shift by a row
             hit = np.flatnonzero(apart.any(axis=1))
             if len(hit):
