@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import grpc
@@ -36,9 +37,14 @@ class DaqmxServer(Closing):
         """The device."""
         console = Console(client, name="rig daqmx", any_rig=True) if allow_commands else None
         outputs = Outputs(console, self.device.table.channels.get("speed"))
-        self._servicer = DaqmxServicer(  # pyrefly: ignore[bad-instantiation]
-            self.device, outputs, lambda: RigSource(client, stream=stream, counts=True)
-        )
+        self.task_started = threading.Event()
+        """Set once a task has started to acquire."""
+
+        def open_source() -> RigSource:
+            self.task_started.set()
+            return RigSource(client, stream=stream, counts=True)
+
+        self._servicer = DaqmxServicer(self.device, outputs, open_source)  # pyrefly: ignore[bad-instantiation]
         self._pool = ThreadPoolExecutor(_MAX_CALLS, thread_name_prefix="daqmx")
         self._server = grpc.server(self._pool, options=[("grpc.so_reuseport", 0), ("grpc.max_send_message_length", -1)])
         add_NiDAQmxServicer_to_server(self._servicer, self._server)

@@ -179,7 +179,7 @@ WRONG = {
     "brace of nothing": (
         HEAD + '[device]\ncommand = "python -m json.tool }"\n' + PEAK,
         4,
-        "device.command must be a text with {url}, {can}, {socketcand}, {slcan}, {name}, {folder}, and {{ or }} for a",
+        "device.command must be a text with {url}, {can}, {socketcand}, {slcan}, {daqmx}, {name}, {folder}, and {{",
     ),
     "device and devices": (
         HEAD + TWO.replace("[[devices]]", "[device]", 1) + PEAK,

@@ -18,6 +18,7 @@ from nidaqmx.constants import AccelUnits, AcquisitionType, Edge, LineGrouping, S
 from nidaqmx.error_codes import DAQmxErrors
 from nidaqmx.stream_readers import AnalogMultiChannelReader, AnalogUnscaledReader, CounterReader
 from nidaqmx.system import System
+from nitypes.waveform import DigitalWaveform
 
 from drivers.daqmx.rpc.calls import CHECKED_VERSION
 from drivers.daqmx.server import DaqmxServer
@@ -317,14 +318,19 @@ def test_outputs_send_commands_at_rising_edges(rig: PlayedRig) -> None:
     with DaqmxServer(rig, allow_commands=True) as server, grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
         options = GrpcSessionOptions(channel, "")
         with nidaqmx.Task(grpc_options=options) as lines:
-            lines.do_channels.add_do_chan("rig/port0/line0:3", line_grouping=LineGrouping.CHAN_PER_LINE)
-            lines.write([True, False, False, False])
-            lines.write([True, True, False, False])
-            lines.write([False, False, False, True])
+            lines.do_channels.add_do_chan("rig/port0/line0:1", line_grouping=LineGrouping.CHAN_PER_LINE)
+            lines.do_channels.add_do_chan("rig/port2/line1")
+            lines.write([True, False, False])
+            lines.write([True, True, False])
+            lines.write([False, True, True])
         with nidaqmx.Task(grpc_options=options) as port:
             port.do_channels.add_do_chan("rig/port0", line_grouping=LineGrouping.CHAN_FOR_ALL_LINES)
-            assert port.read() == 8
-            port.write(0b0101)
+            assert port.read() == 2
+            port.write(0b1101)
+            assert port.read() == 0b1101, "lines without an action"
+        with nidaqmx.Task(grpc_options=options) as trip:
+            trip.do_channels.add_do_chan("rig/port2/line0")
+            trip.write(True)
         with nidaqmx.Task(grpc_options=options) as drive:
             drive.ao_channels.add_ao_voltage_chan("rig/ao0", min_val=0.0, max_val=10.0)
             drive.write(2.5)
@@ -334,6 +340,31 @@ def test_outputs_send_commands_at_rising_edges(rig: PlayedRig) -> None:
     assert [fields["speed_hz"] for name, fields in rig.commands if name == "speed"] == [0.0, 10.0]
 
 
+@pytest.mark.parametrize("waveform", [False, True])
+def test_clocked_outputs_write_their_samples_at_the_clock(rig: PlayedRig, waveform: bool) -> None:
+    with (
+        DaqmxServer(rig, allow_commands=True) as server,
+        grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel,
+        nidaqmx.Task(grpc_options=GrpcSessionOptions(channel, "")) as port,
+    ):
+        port.do_channels.add_do_chan("rig/port0", line_grouping=LineGrouping.CHAN_FOR_ALL_LINES)
+        port.timing.cfg_samp_clk_timing(2000.0, samps_per_chan=ROWS // 10 + 5)
+        with refused(DAQmxErrors.OUTPUT_BUF_SIZE_TOO_SMALL_TO_START_GEN):
+            port.start()
+        data = [*[0] * 6, 1, 0, 0, *[1] * 9, 2]  # two hits in one block, then stop; the pattern is repeated
+        assert port.write(DigitalWaveform.from_port(data, mask=15) if waveform else data) == 19
+        assert not rig.commands
+        port.start()
+        rig.send(0)
+        wait_until(lambda: len(rig.commands) == 2, 10.0)
+        with refused(DAQmxErrors.WAIT_UNTIL_DONE_DOES_NOT_INDICATE_DONE):
+            port.wait_until_done(0.0)
+        rig.send(1)
+        port.wait_until_done(10.0)
+        assert port.read() == 0, "sample 25 is the last one"
+    assert [name for name, _ in rig.commands] == ["hammer", "speed"]
+
+
 def test_wrong_settings_are_refused_with_the_codes_of_the_vendor(
     task: nidaqmx.Task, options: GrpcSessionOptions
 ) -> None:
@@ -341,6 +372,8 @@ def test_wrong_settings_are_refused_with_the_codes_of_the_vendor(
         task.ai_channels.add_ai_voltage_chan("Dev1/ai0")
     with refused(DAQmxErrors.PHYSICAL_CHAN_DOES_NOT_EXIST):
         task.ai_channels.add_ai_voltage_chan("rig/ai15")
+    with refused(DAQmxErrors.FUNCTION_NOT_SUPPORTED_FOR_DEVICE):
+        task.ai_channels.add_ai_thrmcpl_chan("rig/ai0")
     with refused(DAQmxErrors.CAN_NOT_PERFORM_OP_WHEN_NO_CHANS_IN_TASK):
         task.start()
     with refused(DAQmxErrors.MIN_NOT_LESS_THAN_MAX):
@@ -377,7 +410,10 @@ def test_the_system_lists_the_device(options: GrpcSessionOptions) -> None:
     assert (device.name, device.is_simulated, device.ai_max_multi_chan_rate) == ("rig", True, 20_000.0)
     assert device.ai_physical_chans.channel_names == [f"rig/ai{n}" for n in range(15)]
     assert device.terminals == ["/rig/PFI0", "/rig/PFI8"]
-    assert [each.channel_names for each in (device.ci_physical_chans, device.do_ports)] == [["rig/ctr0"], ["rig/port0"]]
+    assert [each.channel_names for each in (device.ci_physical_chans, device.do_ports)] == [
+        ["rig/ctr0"],
+        ["rig/port0", "rig/port2"],
+    ]
 
 
 def test_tasks_of_lost_programs_are_bounded(options: GrpcSessionOptions) -> None:

@@ -24,8 +24,11 @@ _CI = (
     UsageTypeCI.PULSE_TIME,
 )
 _CI_USAGES = [usage.value for usage in _CI]
-OUTPUT_LINES = {0: "hit", 1: "stop", 2: "trip", 3: "release"}
-"""Action at the rising edge of each line of port0."""
+OUTPUT_LINES = {
+    "port0/line0": "hit", "port0/line1": "stop", "port0/line2": "", "port0/line3": "",
+    "port2/line0": "trip", "port2/line1": "release",
+}  # fmt: skip
+"""Action at the rising edge of each output line, if any. A pattern for a whole port0 does not end the run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +59,8 @@ class Device:
         """Channel of the table by physical analogue input, in table order."""
         terminals = {"hammer": Terminal("hammer", _HAMMER_LEVEL_N), "keyphasor": Terminal("keyphasor", PULSE_LEVEL)}
         self._terminals = {name: terminal for name, terminal in terminals.items() if name in table.channels}
-        self.lines = {f"{name}/port0/line{n}": n for n in OUTPUT_LINES}
-        """Number of each output line."""
+        self.lines = {f"{name}/{line}": line for line in OUTPUT_LINES}
+        """Output lines, without the device."""
         signals = enumerate(self._terminals.values())
         self.inputs = {f"{name}/port1/line{n}": terminal for n, terminal in signals}
         """Signal of each input line."""
@@ -130,8 +133,9 @@ class Device:
             "SERIAL_NUM": 0, "BUS_TYPE": BusType.TCPIP.value, "TCPIP_HOSTNAME": "127.0.0.1", "IS_SIMULATED": True,
             "AI_PHYSICAL_CHANS": ", ".join(self.channels), "AO_PHYSICAL_CHANS": ", ".join(self.analog_outputs),
             "CI_PHYSICAL_CHANS": ", ".join(self.counters), "CO_PHYSICAL_CHANS": "",
-            "DI_LINES": ", ".join(self.inputs | self.lines), "DI_PORTS": f"{self.name}/port0, {self.name}/port1",
-            "DO_LINES": ", ".join(self.lines), "DO_PORTS": f"{self.name}/port0",
+            "DI_LINES": ", ".join(self.inputs | self.lines),
+            "DI_PORTS": ", ".join(f"{self.name}/port{n}" for n in range(3)),
+            "DO_LINES": ", ".join(self.lines), "DO_PORTS": f"{self.name}/port0, {self.name}/port2",
             "TERMINALS": ", ".join(self.terminals),
             "AI_MAX_SINGLE_CHAN_RATE": max(rates), "AI_MAX_MULTI_CHAN_RATE": min(rates), "AI_MIN_RATE": 1.0,
             "AI_SIMULTANEOUS_SAMPLING_SUPPORTED": True,
@@ -152,7 +156,8 @@ class Device:
         self.expand(name, [*self.channels, *self.analog_outputs, *self.counters, *self.inputs, *self.lines])
         return {
             "PHYSICAL_CHAN_AI_SUPPORTED_MEAS_TYPES": _AI_USAGES, "PHYSICAL_CHAN_CI_SUPPORTED_MEAS_TYPES": _CI_USAGES,
-            "PHYSICAL_CHAN_DI_SAMP_CLK_SUPPORTED": name in self.inputs, "PHYSICAL_CHAN_DO_SAMP_CLK_SUPPORTED": False,
+            "PHYSICAL_CHAN_DI_SAMP_CLK_SUPPORTED": name in self.inputs,
+            "PHYSICAL_CHAN_DO_SAMP_CLK_SUPPORTED": name in self.lines,
         }  # fmt: skip
 
     @property

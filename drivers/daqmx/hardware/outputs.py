@@ -30,7 +30,7 @@ class Outputs:
         self._speed = speed
         self._lock = threading.Lock()
         self.lines = dict.fromkeys(OUTPUT_LINES, False)
-        """State of each line of port0."""
+        """State of each line."""
 
     def check(self) -> None:
         """Raise an error unless commands are allowed.
@@ -43,18 +43,27 @@ class Outputs:
                 Code.RESOURCE_ALREADY_RESERVED, "outputs command the rig; start `rig daqmx` with --allow-commands"
             )
 
-    def set_lines(self, states: dict[int, bool]) -> None:
-        """Set lines; a rising edge sends the command of its line.
+    def set_lines(self, *samples: dict[str, bool]) -> None:
+        """Set lines, sample after sample; rising edges send the command of their line, once for all samples.
 
         Raises:
-            DaqmxError: The rig refused a command.
+            DaqmxError: The rig refused a command; the others were sent.
         """
         self.check()
+        actions: dict[str, None] = {}
+        failures: list[DaqmxError] = []
         with self._lock:
-            for number, state in states.items():
-                rises, self.lines[number] = state and not self.lines[number], state
-                if rises:
-                    self._command(_ACTIONS[OUTPUT_LINES[number]])
+            for line, state in (item for states in samples for item in states.items()):
+                if state and not self.lines[line] and OUTPUT_LINES[line]:
+                    actions[OUTPUT_LINES[line]] = None
+                self.lines[line] = state
+            for action in actions:
+                try:
+                    self._command(_ACTIONS[action])
+                except DaqmxError as error:
+                    failures.append(error)
+        if failures:
+            raise failures[0]
 
     def set_volts(self, volts: float) -> None:
         """Set the speed set point by its voltage, on the scale of the speed channel.

@@ -34,16 +34,22 @@ def call(pattern: str) -> Callable[[Any], Any]:
 
 
 class Calls(NiDAQmxServicer):
-    """Servicer whose methods are marked by `call`; other calls are not implemented."""
+    """Servicer whose methods are marked by `call`; other calls are refused."""
 
     def bind(self) -> None:
         """Bind the methods to the calls of the protocol."""
         methods = [getattr(self, name) for name in dir(type(self)) if hasattr(getattr(type(self), name), "pattern")]
-        for name in filter(str.isidentifier, vars(NiDAQmxServicer)):
-            for method in methods:
-                if match := method.pattern.fullmatch(name):
-                    handle = _stream if name.startswith("Register") else _respond
-                    setattr(self, name, partial(handle, method, f"{name}Response", match.groups()))
+        for name in vars(NiDAQmxServicer):
+            if name.startswith("_"):
+                continue
+            handle = _stream if name.startswith("Register") else _respond
+            found = [(method, match.groups()) for method in methods if (match := method.pattern.fullmatch(name))]
+            method, groups = found[0] if found else (_refuse_call, (name,))
+            setattr(self, name, partial(handle, method, f"{name}Response", groups))
+
+
+def _refuse_call(_: Any, __: Any, ___: Any, name: str) -> NoReturn:
+    raise DaqmxError(Code.FUNCTION_NOT_SUPPORTED_FOR_DEVICE, name)
 
 
 def _respond(method: Any, response: str, groups: tuple[str, ...], request: Any, context: Any) -> Any:

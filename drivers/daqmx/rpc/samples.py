@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,6 +14,7 @@ from drivers.daqmx.rpc.calls import call
 from drivers.daqmx.rpc.properties import Properties
 from drivers.daqmx.tasks.task import POLL_S, Task
 from drivers.sources.samples import Samples
+from rig.base.errors import RefusedError
 
 _KINDS = {
     "Analog": ChannelType.ANALOG_INPUT, "Binary": ChannelType.ANALOG_INPUT,
@@ -98,7 +100,7 @@ class DaqmxServicer(Properties):
         task, count, columns = self.task(request), 1, {}
         _check_kind(task, ChannelType.DIGITAL_INPUT, ChannelType.DIGITAL_OUTPUT)
         lines, device = [channel.physical for channel in task.channels], self._device
-        if task.plan()[0]:
+        if task.kind is ChannelType.DIGITAL_INPUT and task.plan()[0]:
             wanted = 1 if kind == "ScalarU32" else request.num_samps_per_chan
             samples, status = task.read(wanted, request.timeout, context.is_active)
             count, columns = len(samples), dict(zip(samples.names, samples.values.T, strict=True))
@@ -127,31 +129,55 @@ class DaqmxServicer(Properties):
             response.read_array.extend(_fill(values, request).tolist())
             response.samps_per_chan_read = count
 
-    @call("WriteDigital(Lines|U32|ScalarU32)")
+    @call("WriteDigital(Lines|U32|ScalarU32|Waveforms)")
     def write_lines(self, request: Any, _: Any, response: Any, kind: str) -> None:
-        """Set lines, given as one byte each or as the bits of a number."""
-        task = self._open(request, ChannelType.DIGITAL_OUTPUT)
+        """Set lines, given as one byte each or as the bits of a number; with a sample clock, at the clock."""
+        task = self.task(request)
+        _check_write(task, ChannelType.DIGITAL_OUTPUT)
         lines = [channel.physical for channel in task.channels]
-        if kind == "Lines":
+        bytewise = kind in ("Lines", "Waveforms")
+        if kind == "Waveforms":
+            columns = [
+                np.frombuffer(each.y_data, np.uint8).reshape(-1, max(1, each.signal_count))[:, ::-1]  # line 0 is last
+                for each in request.waveforms
+            ]
+            if [each.shape[1] for each in columns] != list(map(len, lines)) or len(set(map(len, columns))) != 1:
+                raise DaqmxError(Code.NUM_LINES_MISMATCH_IN_READ_OR_WRITE, "a signal for each line of each channel")
+            samples: Any = list(zip(*columns, strict=True))
+        elif kind == "Lines":
             data = np.frombuffer(request.write_array, dtype=np.uint8)
             samples = _unfill(data, request, (len(lines), max(map(len, lines))))
         else:
             data = np.array([request.value] if kind == "ScalarU32" else request.write_array, dtype=np.int64)
             samples = _unfill(data, request, (len(lines),))
+        pattern = []
         for sample in samples:
             states = {}
             for group, value in zip(lines, sample, strict=True):
                 for place, line in enumerate(group):
-                    bit = value[place] if kind == "Lines" else value >> _get_line(line) & 1
+                    bit = value[place] if bytewise else value >> _get_line(line) & 1
                     states[self._device.lines[line]] = bool(bit)
+            pattern.append(states)
+        if task.clocked and pattern:
+            task.output = lambda numbers: self._generate([pattern[number % len(pattern)] for number in numbers])
+        self._start(task, request)
+        for states in [] if task.clocked else pattern:
             self._outputs.set_lines(states)
         if kind != "ScalarU32":
             response.samps_per_chan_written = len(samples)
 
+    def _generate(self, samples: list[dict[str, bool]]) -> None:
+        """Set lines at the clock; like a signal without feedback, an edge that the rig refuses has no effect."""
+        with contextlib.suppress(DaqmxError, RefusedError, ConnectionError):
+            self._outputs.set_lines(*samples)
+
     @call("WriteAnalog(Scalar)?F64")
     def write_volts(self, request: Any, _: Any, response: Any, scalar: str | None) -> None:
         """Set the set point of the drive."""
-        limits = self._open(request, ChannelType.ANALOG_OUTPUT).channels[0].attributes
+        task = self.task(request)
+        _check_write(task, ChannelType.ANALOG_OUTPUT)
+        self._start(task, request)
+        limits = task.channels[0].attributes
         values = [request.value] if scalar else list(request.write_array)
         for volts in values:
             if not limits["AO_MIN"] <= volts <= limits["AO_MAX"]:
@@ -160,16 +186,12 @@ class DaqmxServicer(Properties):
         if not scalar:
             response.samps_per_chan_written = len(values)
 
-    def _open(self, request: Any, kind: ChannelType) -> Task:
-        """Return the task of a write, started."""
-        task = self.task(request)
-        if task.kind is not kind:
-            raise DaqmxError(Code.WRITE_CHAN_TYPE_MISMATCH, "the channels of the task are of another kind")
-        if not task.started:
-            if not request.auto_start:
-                raise DaqmxError(Code.CANNOT_WRITE_WHEN_AUTO_START_FALSE_AND_TASK_NOT_RUNNING, "start the task")
+    def _start(self, task: Task, request: Any) -> None:
+        """Start the task of a write."""
+        if not task.started and request.auto_start:
             task.start()
-        return task
+        elif not task.started and not task.clocked:
+            raise DaqmxError(Code.CANNOT_WRITE_WHEN_AUTO_START_FALSE_AND_TASK_NOT_RUNNING, "start the task")
 
     # ---- events ----
 
@@ -207,6 +229,11 @@ class DaqmxServicer(Properties):
 def _check_kind(task: Task, *kinds: ChannelType) -> None:
     if task.kind not in kinds:
         raise DaqmxError(Code.READ_CHAN_TYPE_MISMATCH, f"the task has channels of the kind {task.kind.name.lower()}")
+
+
+def _check_write(task: Task, kind: ChannelType) -> None:
+    if task.kind is not kind:
+        raise DaqmxError(Code.WRITE_CHAN_TYPE_MISMATCH, "the channels of the task are of another kind")
 
 
 def _fill(values: np.ndarray, request: Any) -> np.ndarray:

@@ -127,8 +127,8 @@ class Sessions(Calls):
     def configure_timing(self, request: Any, _: Any, __: Any, kind: str) -> None:
         """Set the sample clock and the number of samples."""
         task = self.task(request)
-        if task.kind in (ChannelType.DIGITAL_OUTPUT, ChannelType.ANALOG_OUTPUT):
-            refuse_value("SAMP_TIMING_TYPE", "on demand for outputs", kind)
+        if task.kind is ChannelType.ANALOG_OUTPUT or (task.kind, kind) == (ChannelType.DIGITAL_OUTPUT, "Implicit"):
+            refuse_value("SAMP_TIMING_TYPE", "on demand for outputs, or a sample clock for lines", kind)
         task.set("SAMP_QUANT_SAMP_MODE", request.sample_mode_raw)
         task.set("SAMP_QUANT_SAMP_PER_CHAN", request.samps_per_chan)
         if kind == "Implicit":

@@ -79,6 +79,11 @@ class Configuration:
             raise DaqmxError(Code.CAN_NOT_PERFORM_OP_WHEN_NO_CHANS_IN_TASK, "create a channel first")
         return self.channels[0].kind
 
+    @property
+    def clocked(self) -> bool:
+        """Whether the task has a sample clock."""
+        return bool(self.settings["SAMP_TIMING_TYPE"] == SampleTimingType.SAMPLE_CLOCK.value)
+
     def add(self, channels: list[VirtualChannel]) -> None:
         """Add channels.
 
@@ -198,11 +203,10 @@ class Configuration:
             return [self.device.channels[channel.physical[0]] for channel in self.channels]
         if self.kind is ChannelType.COUNTER_INPUT:
             return [self._find_signal().channel]
-        if self.kind is ChannelType.DIGITAL_INPUT:
+        if self.kind in (ChannelType.DIGITAL_INPUT, ChannelType.DIGITAL_OUTPUT):
             lines = [line for channel in self.channels for line in channel.physical]
             found = [self.device.inputs[line].channel for line in lines if line in self.device.inputs]
-            clocked = self.settings["SAMP_TIMING_TYPE"] == SampleTimingType.SAMPLE_CLOCK.value
-            return list(dict.fromkeys(found or list(self.device.channels.values())[:clocked]))
+            return list(dict.fromkeys(found or list(self.device.channels.values())[: self.clocked]))
         return []
 
     def _find_signal(self) -> Terminal:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -41,6 +43,9 @@ class Task(Configuration):
         self.position = 0
         """Samples read since the start."""
         self.acquisition: Acquisition | None = None
+        self.output: Callable[[range], None] | None = None
+        """Writes the output samples of a range to the lines, for a task with a sample clock."""
+        self._generator = threading.Thread()
         self._plan = Plan(0)
         self._open_source = open_source
 
@@ -54,12 +59,18 @@ class Task(Configuration):
             self._check_stopped()
             names, rate_hz, plan = self.plan()
             if names:
+                generates = self.kind is ChannelType.DIGITAL_OUTPUT
+                if generates and self.output is None:
+                    raise DaqmxError(Code.OUTPUT_BUF_SIZE_TOO_SMALL_TO_START_GEN, "write samples first")
                 source = self._open_source()
                 try:
                     self.acquisition = Acquisition(source, names, rate_hz, plan)
                 except BaseException:
                     source.close()
                     raise
+                if generates:
+                    self._generator = threading.Thread(target=self._generate, args=(self.acquisition,), daemon=True)
+                    self._generator.start()
             self._plan, self.position, self.started = plan, 0, True
             self.changed.notify_all()
 
@@ -85,7 +96,7 @@ class Task(Configuration):
             raise DaqmxError(*acquisition.failure)
         if acquisition.ended is not None and not acquisition.complete:
             raise DaqmxError(Code.DEV_CANNOT_BE_ACCESSED, acquisition.ended)
-        return acquisition.complete
+        return acquisition.complete and not self._generator.is_alive()
 
     def wait_for_change(self, timeout_s: float) -> None:
         """Wait for the next start or stop."""
@@ -104,6 +115,18 @@ class Task(Configuration):
                 raise DaqmxError(Code.WAIT_UNTIL_DONE_DOES_NOT_INDICATE_DONE, f"not done after {timeout_s:g} s")
             if (acquisition := self.acquisition) is not None:
                 acquisition.wait(timeout_s=min(POLL_S, deadline.left_s))
+                if self._generator.is_alive():
+                    self._generator.join(min(POLL_S, deadline.left_s))
+
+    def _generate(self, acquisition: Acquisition) -> None:
+        """Write the output samples at the sample clock: those of a block when the block arrives."""
+        number = 0
+        while not (acquisition.done and not acquisition.available):
+            with contextlib.suppress(LinkTimeoutError, StreamEndedError):
+                arrived = len(acquisition.read(ALL_AVAILABLE, timeout_s=POLL_S, whole=False))
+                if self.acquisition is acquisition and self.output is not None:
+                    self.output(range(number, number + arrived))
+                number += arrived
 
     # ---- reads ----
 

@@ -152,6 +152,9 @@ class Bench(Closing):
         self.settings, self.target = settings, target
         self.name = f"bench-{os.getpid()}-{next(_NUMBERS)}"
         self._program: Program | None = None
+        self._daqmx: Program | None = None
+        self._daqmx_port = ""
+        self._folder = folder
         self._clients: list[Rig] = []
         self.client_names: set[str] = set()
         """Names of the clients of the test."""
@@ -208,6 +211,25 @@ class Bench(Closing):
         table = [] if settings.table is None else ["--channels", str(settings.table)]
         pace = ["--pace", settings.pace, "--block-ms", f"{settings.block_ms:g}"]
         return [*rig, "run", settings.scene or DEFAULT_SCENE, *pace, *listen, *sets, *table]
+
+    def serve_daqmx(self) -> str:
+        """Return the port of a NI-DAQmx server of the rig, which the first call starts.
+
+        Raises:
+            BenchError: If it does not start.
+        """
+        if self._daqmx is None:
+            command = [sys.executable, "-m", "rig", "daqmx", "--connect", self.url, "--port", "0", "--allow-commands"]
+            self._daqmx = Program(command, self._folder / "daqmx.log")
+            if (line := self._daqmx.wait_for(_DAQMX, self.settings.wait.start_s)) is None:
+                raise BenchError(f"rig daqmx did not start: {self._daqmx.last_line}")
+            self._daqmx_port = line.partition(_DAQMX)[2].partition(";")[0]
+        return self._daqmx_port
+
+    @property
+    def daqmx_runs(self) -> bool | None:
+        """Whether a task of the NI-DAQmx server has run; None without a server."""
+        return None if self._daqmx is None else self._daqmx.wait_for("rig: a task started", 0.0) is not None
 
     def begin(self) -> float:
         """Start a recording, if one is played, and return the simulated time at which the test begins [s]."""
@@ -379,6 +401,8 @@ class Bench(Closing):
         for client in self._clients:
             client.close()
         self._clients.clear()
+        if self._daqmx is not None:
+            self._daqmx.end()
         if self._program is not None:
             self._program.end()
 
@@ -428,6 +452,7 @@ class Bench(Closing):
 
 
 DEFAULT_SCENE = "stable-run"
+_DAQMX = "NI-DAQmx device rig at 127.0.0.1:"
 _SLCAN = "SLCAN adapter on "
 """Words of the rig before the path of its pseudo-terminal."""
 _NUMBERS = itertools.count(1)

@@ -23,7 +23,7 @@ PLACEHOLDER = re.compile(r"\{\{|\}\}|\{(\w+)(?::([^{}]*))?\}|[{}]")
 """A placeholder, an escaped brace, or a single brace."""
 _LINK_S = 10.0
 """Longest wait for a device's connection [s]."""
-PLACES = ("url", "can", "socketcand", "slcan", "name", "folder")
+PLACES = ("url", "can", "socketcand", "slcan", "daqmx", "name", "folder")
 """Placeholders of a command line that are filled in at the start."""
 CAN_PLACES = ("can", "socketcand", "slcan")
 """Placeholders that need a CAN bus."""
@@ -34,8 +34,8 @@ class Device:
 
     Args:
         command: Command line. Placeholders: `{url}` (address of the rig), `{can}` (its address on the CAN bus),
-            `{socketcand}` (HOST:PORT of its socketcand server), `{slcan}` (path of its SLCAN adapter), `{name}` (name
-            of the device) and `{folder}` (folder for its files).
+            `{socketcand}` (HOST:PORT of its socketcand server), `{slcan}` (path of its SLCAN adapter), `{daqmx}` (port
+            of its NI-DAQmx server), `{name}` (name of the device) and `{folder}` (folder for its files).
         name: Name of the device.
         may_end: Whether it may end before the run.
         bench: Bench that it is tested on.
@@ -51,9 +51,10 @@ class Device:
         self, command: str | Sequence[str], *, name: str, bench: Bench, log: Path, where: Path, files: Path,
         may_end: bool = False,
     ) -> None:  # fmt: skip
-        given = (bench.url, bench.can_url, bench.socketcand_url, bench.slcan_path, name, str(files))
-        places = {place: text for place, text in zip(PLACES, given, strict=True) if text is not None}
         words = shlex.split(command) if isinstance(command, str) else list(map(str, command))
+        daqmx = bench.serve_daqmx() if any("{daqmx}" in word for word in words) else None
+        given = (bench.url, bench.can_url, bench.socketcand_url, bench.slcan_path, daqmx, name, str(files))
+        places = {place: text for place, text in zip(PLACES, given, strict=True) if text is not None}
         words = [fill_placeholders(word, places, "command") for word in words]
         check_program(words, where, field="command")
         self.name, self.log, self.folder, self.may_end, self.bench = name, log, files, may_end, bench
@@ -102,7 +103,9 @@ class Device:
         )
 
     def wait_until_linked(self, before: int) -> None:
-        """Wait briefly until the rig has more connections than before; a device on a CAN bus never adds one.
+        """Wait briefly until the rig has more connections than before, or until a task of NI-DAQmx runs.
+
+        A device on a CAN bus never adds a connection.
 
         Args:
             before: Number of connections before the device was started.
@@ -111,7 +114,7 @@ class Device:
             BenchError: If the device has ended.
         """
         for _ in Deadline(_LINK_S).polls():
-            if self.bench.links > before:
+            if self.bench.daqmx_runs or (self.bench.daqmx_runs is None and self.bench.links > before):
                 return
             self.check_running()
 

@@ -14,6 +14,8 @@ from rig.cli.signals import stop_on_signals
 
 _PORT = 31763
 """Port of NI's own server."""
+_POLL_S = 0.1
+"""Period at which the start of the first task is checked [s]."""
 
 
 def daqmx(
@@ -52,4 +54,8 @@ def daqmx(
             echo(f"{terminal:14s}{signal.channel}")
         echo(f"rig: NI-DAQmx device {device} at 127.0.0.1:{server.port}; Ctrl-C ends it", err=True)
         with stop_on_signals(done.set):
+            while not (done.wait(_POLL_S) or server.task_started.is_set()):
+                pass
+            if not done.is_set():
+                echo("rig: a task started", err=True)
             done.wait()
