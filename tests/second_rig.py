@@ -68,7 +68,7 @@ class Rig(NamedTuple):
     P0: float = 3000.0
     g: float = 9.81
     exponent: float = 1.5
-    late: bool = False  # each contact begins with the first step that ends inside the ring
+    late: bool = False  # each contact begins at the first multiple of 2 us inside the ring
 
 
 @njit(cache=True)
@@ -153,7 +153,7 @@ def _run(rig, y, omega0, pulse, t0, steps, every, rows):
         _rates(rig, t, omega0, pulse, v0, y, work[0], inputs)
         ahead = _step(rig, t, h, omega0, pulse, v0, y, work)
         depth, rate = _rates(rig, t + h, omega0, pulse, v0, ahead, work[0], work[5])
-        if depth > 0.0 and v0 == 0.0:
+        if depth > 0.0 and v0 == 0.0 and not (rig.late and (n + 1) % 4):
             low, part = 0.0, 1.0
             for _ in range(0 if rig.late else 50):
                 middle = 0.5 * (low + part)
