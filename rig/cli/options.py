@@ -112,6 +112,8 @@ def subtract_run_out(text: str | None, *recordings: Recording, log: bool = False
     if match is None:
         raise InputError("--run-out", "a recording, with times such as SLOW.mcap:1.5-9", text)
     from_s, to_s = (None if time is None else float(time) for time in match.groups()[1:])
+    if from_s is not None and to_s is not None and from_s >= to_s:
+        raise InputError("--run-out", "a recording, with ascending times such as SLOW.mcap:1.5-9", text)
     slow = join([Path(match[1])])
     corrected = [subtract_runout(one, slow, orders=_RUNOUT_ORDERS, from_s=from_s, to_s=to_s) for one in recordings]
     typer.echo(corrected[0].correction[0], err=True)

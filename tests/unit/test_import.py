@@ -707,6 +707,26 @@ def test_a_hammer_pulse_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
     assert recording.metadata["rig"]["scene"] == "hammer"
 
 
+def test_an_incomplete_hammer_pulse_is_reported(tmp_path: Path) -> None:
+    path = hammer_log(tmp_path / "x.csv", at_s=0.73211, force_n=87.0, duration_s=6.5e-3)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    ends = rows_of(tmp_path / "ends.csv", lines[:7350])
+    gap = rows_of(tmp_path / "gap.csv", [re.sub(",[^,]*", ",", line, count=1) if 7350 < n < 7380 else line
+                                         for n, line in enumerate(lines)])  # fmt: skip
+    for log, incomplete in ((path, 0), (ends, 1), (gap, 1)):
+        conversion, _ = imported(tmp_path, [log], HAMMER_MAPPING, name=log.stem)
+        assert sum("is incomplete" in remark for remark in conversion.remarks) == incomplete
+    with pytest.raises(
+        InputError, match=r"^time must be a range with a hammer pulse \(at 0.7321 s\); received 1 to inf s"
+    ):
+        imported(tmp_path, [path], f"[time]\nfrom_s = 1.0\n{HAMMER_MAPPING}", name="after")
+
+
+def rows_of(path: Path, lines: list[str]) -> Path:
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
 def test_a_delay_moves_a_channel_back(tmp_path: Path) -> None:
     t = np.arange(2000) / 10_000
     late_s = 370e-6
@@ -847,6 +867,7 @@ X = '[channels.disk_x]\nsource = "x"\n'
         ("[file]\ntime_column = 'none'\n" + X, "m.toml: time.rate_hz must be set, as the file has no rate"),
         ("[file]\nencoding = 'klingon'\n" + X, "m.toml: file.encoding must be a text encoding"),
         ("[hammer]\n" + X, "m.toml: hammer must be left out without a channel `hammer`"),
+        ("[keyphasor]\nsource = 'y'\nangle_deg = 400\n" + X, "m.toml: keyphasor.angle_deg must be less than or equal"),
         ("[keyphasor]\nsource = 'y'\nthreshold = 99.0\n" + X, "m.toml: keyphasor.threshold must be between 2 and 5"),
         (
             "[[rotate]]\nchannels = ['disk_x', 'disk_y']\nangles_deg = [0, 90]\n" + X,

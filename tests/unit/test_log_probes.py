@@ -158,6 +158,7 @@ def test_both_recordings_of_a_comparison_are_corrected(
     ("validate QUIET", "SESSION", "a slow roll of at most 1.55 Hz"),
     ("validate SESSION", "SLOW", "used with a log of another system; received"),
     ("identify SESSION --fit contact.friction", "SLOW", "used with a log of another system; received"),
+    ("validate QUIET", "SLOW:4-1", "a recording, with ascending times such as SLOW.mcap:1.5-9; received"),
 ])  # fmt: skip
 def test_an_unusable_slow_roll_is_refused(
     command: str, option: str, message: str, quiet: Recording, slow: Recording, tmp_path: Path,

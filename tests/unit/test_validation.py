@@ -21,7 +21,7 @@ from replays.recordings.validation.bits import Bits
 from replays.recordings.validation.criteria import DEFAULT, Criteria
 from replays.recordings.validation.explanations.attribution import Explained, Explanation, attribute, conclude
 from replays.recordings.validation.explanations.signals import SignalFault
-from replays.recordings.validation.phases import View, find_phases, quantities, spectrum_distance
+from replays.recordings.validation.phases import Phase, View, find_phases, quantities, spectrum_distance
 from rig.base.errors import InputError
 from rig.base.outcome import Outcome
 from rig.base.wire import EDGES, EVENTS, encode_block, encode_document, sensor_key, truth_key
@@ -417,7 +417,7 @@ def test_floated_numbers_are_fitted_to_a_recording_of_the_rig_and_not_judged(
     assert code == 0
     assert abs(floated["value"] - 0.22) < floated["half_width"] < 1e-3
     code, _, text = run_captured(capsys, *arguments[:-2], "contact.frictoin")
-    assert (code, "contact.friction" in text) == (2, True)
+    assert (code, "contact.friction" in text, text.startswith("rig: --float must be of a parameter")) == (2, True, True)
 
 
 def test_a_number_that_a_recording_does_not_determine_is_no_pass(tmp_path: Path) -> None:
@@ -425,6 +425,16 @@ def test_a_number_that_a_recording_does_not_determine_is_no_pass(tmp_path: Path)
     found = validate(free, criteria=make_criteria().with_floating(["contact.restitution"]))
     assert found.outcome is Outcome.INCONCLUSIVE
     assert "does not determine contact.restitution" in found.verdict_line
+
+
+def test_a_log_without_phases_passes_only_if_its_samples_were_compared_to_the_end(tmp_path: Path) -> None:
+    found = validate(record_scene(tmp_path / "free.mcap", duration_s=0.02))
+    end_s = found.window_s[1]
+    for last_s, verdict in ((end_s, Outcome.PASS), (1.5 * end_s, Outcome.INCONCLUSIVE)):
+        phases = (Phase("free run", 0.0, last_s),)
+        log = replace(found, bits={}, bit_exact=False, statistics=(), phases=phases)
+        assert log.outcome is verdict, log.verdict_line
+    assert f"the {0.5 * end_s:.3g} s after them were not compared" in log.verdict_line
 
 
 def test_a_floated_number_is_no_candidate_for_a_cause() -> None:

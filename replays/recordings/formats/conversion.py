@@ -24,7 +24,7 @@ from replays.recordings.formats.group import ImportedChannel, PlacedGroup, nomin
 from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, convert_to_engineering
 from replays.recordings.formats.mapping import Mapping
 from rig.base import wire
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 from rig.base.files import open_file
 from rig.channels.table import ChannelTable, default_table
 
@@ -257,12 +257,21 @@ def _range(signals: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse
         hammer = next(entry for entry in signals if entry.name == "hammer")
         all_pulses, passed_over = find_pulses(hammer.values, hammer.axis, mapping.hammer)
         pulses = tuple(pulse for pulse in all_pulses if low <= pulse.at_s <= high)
+        if all_pulses and not pulses:
+            times = ", ".join(f"{pulse.at_s:.4g} s" for pulse in all_pulses[:5])
+            raise InputError("time", f"a range with a hammer pulse (at {times})", Words(f"{low:g} to {high:g} s"))
         if not pulses:
             largest = find_extent(hammer.values)[1]
             raise InputError("hammer.threshold_n", f"below the largest force, {largest:.3g} N, in what is imported",
                              mapping.hammer.threshold_n)  # fmt: skip
         first_pulses = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in pulses[:5])
         log.remarks.append(f"{len(pulses)} hammer pulses found: {first_pulses}")
+        log.remarks += [
+            f"the hammer pulse at {pulse.at_s:.4f} s is incomplete, as the log begins or ends there, or samples "
+            "are missing: its force and duration are wrong"
+            for pulse in pulses
+            if pulse.is_cut
+        ]
         if lost := [f"{b.force_n:.4g} N at {b.at_s:.4f} s" for b in passed_over if low <= b.at_s <= high]:
             log.remarks.append(
                 f"{len(lost)} hammer pulses ignored, as too soon after another; predictions do not include "

@@ -28,6 +28,10 @@ _TEXT_OPTIONS = (
 """Options that apply to text files only."""
 
 
+Degrees = Annotated[FiniteFloat, Field(ge=-360.0, le=360.0)]
+"""Angle [degrees]; beyond a turn it is a typing error."""
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -204,7 +208,7 @@ class Rotate(_Section):
 
     channels: tuple[str, str]
     """Channels of the two probes; they become x and y."""
-    angles_deg: tuple[FiniteFloat, FiniteFloat]
+    angles_deg: tuple[Degrees, Degrees]
     """Angle of each probe: direction of positive values, from x (EAST) toward y (up) [degrees]."""
 
 
@@ -231,7 +235,7 @@ class KeyphasorMapping(SignalName):
     hysteresis: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
     """Distance by which the signal must fall back before the next edge counts; omitted: a tenth of its range."""
     pulses_per_turn: Annotated[int, Field(ge=1)] = 1
-    angle_deg: FiniteFloat | None = None
+    angle_deg: Degrees | None = None
     """Angle of the shaft at the edge: direction of its zero mark, from which `shaft.unbalance_phase` counts, from x
     (EAST) toward y (up) [degrees]; omitted: unknown."""
     angle_uncertainty_deg: PositiveFloat = 5.0

@@ -149,7 +149,7 @@ def validate(
     if untold and any(one.quantity == "contact_fraction" and one.foretold == 0.0 < one.recorded for one in judged):
         return replace(validation, explained=_unexplained(
             next(one.from_s for one in phases if one.name in CONTACT), "the shaft touches the ring from there on, but "
-            "the known experiment causes no contact: a hammer pulse may be missing from the mapping ([[commands]])",
+            "the known experiment causes no contact: a hammer pulse may be missing from the mapping ([experiment])",
         ))  # fmt: skip
     if not firsts and again.tuned is not None and not again.faults:
         text = "up to there all channels agree; the later difference is due to contact (`rig identify --fit "
@@ -190,7 +190,10 @@ def _check_request(recording: Recording, experiment: Experiment, criteria: Crite
     if budget and not is_imported(recording):
         raise InputError("--budget", "used with a log of another system", Words(str(recording.path)))
     if criteria.floating:
-        ask(recording, experiment, criteria.floating)
+        try:
+            ask(recording, experiment, criteria.floating)
+        except InputError as error:
+            raise InputError(error.field.replace("fit", "floating"), error.must, error.received) from None
 
 
 def _make_budgets(

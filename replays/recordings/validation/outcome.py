@@ -28,6 +28,8 @@ from rig.channels.faults.defects import defects_in, earlier_name
 
 _MIN_JUDGED = 0.99
 """Part of a recording's rows that must have been compared for a pass."""
+_MAX_UNSEEN = 0.01
+"""Time after the compared samples of a log without phases, over theirs, that a pass does not need."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,10 @@ class Validation:
             if rows < _MIN_JUDGED * (rows + self.skipped):
                 return f"{self.skipped} of {rows + self.skipped} rows are lost and were not compared"
             return "" if rows else "no row was compared"
+        (begin_s, end_s), last_s = self.window_s, self.phases[-1].to_s if self.phases else 0.0
+        if not (self.bits or self.statistics) and last_s > end_s + _MAX_UNSEEN * (end_s - begin_s):
+            text = f"the samples to {end_s:.4f} s pass; the {last_s - end_s:.3g} s after them were not compared, as"
+            return f"{text} no pair of probes and no four forces show the phases of motion"
         return "" if self.judged else "no criterion was applied"
 
     @property

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.estimate.runs import split_at_breaks
-from replays.estimate.spool import blocks, spool
+from replays.estimate.spool import blocks
 
 if TYPE_CHECKING:
     from replays.recordings.formats.clock import TimeAxis
@@ -33,12 +33,14 @@ class HammerPulse:
         force_n: Peak [N].
         duration_ms: Length, pi/2 times impulse over peak [ms].
         direction: Direction as in a scene.
+        is_cut: Whether the log begins or ends, or samples are missing, within it.
     """
 
     at_s: float
     force_n: float
     duration_ms: float
     direction: str | float
+    is_cut: bool = False
 
     def command(self) -> dict[str, Any]:
         """Return the pulse as a command of a scene."""
@@ -49,7 +51,7 @@ class HammerPulse:
 
 
 def find_pulses(
-    force_n: np.ndarray, axis: TimeAxis, wanted: HammerMapping
+    force: np.ndarray, axis: TimeAxis, wanted: HammerMapping
 ) -> tuple[list[HammerPulse], list[HammerPulse]]:
     """Return the hammer pulses in a force that count, and separate ones that follow another too soon.
 
@@ -57,11 +59,10 @@ def find_pulses(
     dead time, clearly separate pulses count.
 
     Args:
-        force_n: Force of the hammer [N], shape (n,).
+        force: Force of the hammer [N], shape (n,); nan if missing.
         axis: Its time axis.
         wanted: Threshold, dead time and direction.
     """
-    force = spool(np.nan_to_num(force_n[part]) for part in blocks(len(force_n), force_n))
     above_s, above = list[np.ndarray](), list[np.ndarray]()
     for part in blocks(len(force), force):
         above_s.append(axis.instants(part)[np.abs(force[part]) >= wanted.threshold_n])  # both signs: the hammer rings
@@ -100,4 +101,6 @@ def _pulse(force: np.ndarray, axis: TimeAxis, above: tuple[int, int], wanted: Ha
     peak, impulse = float(pulse.max()), float(pulse.sum()) / axis.rate_hz
     duration = 0.5 * math.pi * impulse / peak
     centre = float(pulse @ when) / float(pulse.sum())
-    return HammerPulse(centre - 0.5 * duration - wanted.delay_us * 1e-6, peak, duration * 1e3, wanted.direction)
+    is_cut = low == 0 or high == len(force) or bool(np.isnan(force[[low - 1, high]]).any())
+    at_s = centre - 0.5 * duration - wanted.delay_us * 1e-6
+    return HammerPulse(at_s, peak, duration * 1e3, wanted.direction, is_cut)
