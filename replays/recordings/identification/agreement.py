@@ -7,7 +7,7 @@ reweighted least squares, in which the majority of the channels prevails.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,8 @@ _MIN_GAIN = 1.0
 """Minimum gain of a step; the cost itself varies by about 1 with the noise."""
 _STEP_FRACTIONS = (1.0, 0.3, 0.1, 0.03)
 """Fractions of a step that are tried in turn until the cost decreases."""
+_DAMPINGS = (0.0, 1e-4, 1e-2)
+"""Dampings of the step, relative to the curvature along each value, that are tried in turn."""
 _MAX_STEPS = 8
 _LONG_BLOCK_S, _SHORT_BLOCK_S = 0.1, 0.004
 """Length of jackknife blocks before the hammer pulse and from it on [s]."""
@@ -127,10 +129,9 @@ def approach(
         by_key = [[one / floor for one, floor in split_channels(predictor.parts, slope)] for slope in slopes]
         here = ChannelState(here.apart, [np.column_stack(columns) for columns in zip(*by_key, strict=True)])
         channel_weights = [max(1.0, rms(z)) for z in here.apart] if by_residuals else signal_sizes(predictor.parts)
-        step = solve_weighted(here.apart, here.slopes, channel_weights, (means - values, deviations), enabled)
         cost = here.cost((values - means) / deviations, enabled)
-        for part in _STEP_FRACTIONS:
-            moved = np.clip(values + part * step, low, high)
+        for step in _list_steps(here, channel_weights, (means - values, deviations), enabled):
+            moved = np.clip(values + step, low, high)
             ahead = evaluate(predictor, moved)
             gained = 0.0 if ahead is None else cost - ahead.cost((moved - means) / deviations, enabled)
             if ahead is not None and gained > 0.0:
@@ -141,6 +142,22 @@ def approach(
         if gained < _MIN_GAIN:
             break
     return values, here
+
+
+def _list_steps(
+    here: ChannelState, channel_weights: list[float], priors: tuple[np.ndarray, np.ndarray], enabled: Sequence[bool]
+) -> Iterator[np.ndarray]:
+    """Yield the steps to try: fractions of the full one, then damped ones, each shape (keys,).
+
+    Where values nearly cancel, as force and length of a pulse, a small error of a slope turns the full step around.
+    """
+    off, deviations = priors
+    curvature = sum(np.sum(a**2, axis=0) / max(1.0, rms(z)) ** 2 for z, a in zip(here.apart, here.slopes, strict=True))
+    for damping in _DAMPINGS:
+        precision = deviations**-2.0 + damping * curvature
+        held = off * deviations**-2.0 / precision, precision**-0.5
+        step = solve_weighted(here.apart, here.slopes, channel_weights, held, enabled)
+        yield from (part * step for part in (_STEP_FRACTIONS if damping == 0.0 else _STEP_FRACTIONS[:1]))
 
 
 def evaluate(predictor: Predictor, values: np.ndarray) -> ChannelState | None:
