@@ -105,6 +105,7 @@ def subtract_run_out(text: str | None, *recordings: Recording, log: bool = False
         return [*recordings]
     from recorder.reader import join
     from replays.plots.signals import subtract_runout
+    from rig.cli.output.tables import echo
 
     if log and (own := [one for one in recordings if "import" not in one.scene]):
         raise InputError("--run-out", "used with a log of another system", Words(str(own[0].path)))
@@ -116,7 +117,7 @@ def subtract_run_out(text: str | None, *recordings: Recording, log: bool = False
         raise InputError("--run-out", "a recording, with ascending times such as SLOW.mcap:1.5-9", text)
     slow = join([Path(match[1])])
     corrected = [subtract_runout(one, slow, orders=_RUNOUT_ORDERS, from_s=from_s, to_s=to_s) for one in recordings]
-    typer.echo(corrected[0].correction[0], err=True)
+    echo(corrected[0].correction[0], err=True)
     return corrected
 
 

@@ -70,7 +70,7 @@ def test_a_mapping_accepts_any_spelling_of_time_units_only() -> None:
     for unit in ("s", "sec", "ms", "us", "\u00b5s", "ns", "min", "h", "datetime", "Minutes", "d", "epoch ms"):
         parse_mapping({"file": {"time_unit": unit}, "channels": channels}, name="m")
     for unit in ("mm", "M", "fortnight"):
-        with pytest.raises(InputError, match=r"m: file.time_unit must be s, ms, us, ns, min, h, d or datetime"):
+        with pytest.raises(InputError, match=r"m: file.time_unit must be s, ms, .*, excel d or datetime"):
             parse_mapping({"file": {"time_unit": unit}, "channels": channels}, name="m")
 
 

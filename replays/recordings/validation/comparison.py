@@ -104,7 +104,7 @@ def validate(
     doubts = [*recording.doubts, *parameter_doubts(recording)]
     lost = missing_rows(recording) if blind else {}
     doubts += [f"{rows} of {due} rows of {key} are missing" for key, (rows, due) in lost.items()]
-    if not (criteria.floating or again.tuned):
+    if not (criteria.floating or again.tuned or changes):
         doubts += find_contradictions(tables, again.nominal, [key for key, one in again.bits.items() if one.equal])
     back = [name for name, part in again.parts.items() if (np.diff(part.times_s) <= 0.0).any()]
     doubts += [f"times of {name} do not ascend: no quantity of its motion is judged" for name in back]

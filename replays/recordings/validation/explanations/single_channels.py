@@ -32,8 +32,10 @@ _NO_FILTER = 1e4
 _MAX_EDGE_SHIFT = 0.1
 """Largest shift of an edge, in turns."""
 _MIN_FOREIGN_PART, _MIN_FOREIGN_CHANNELS, _MIN_FOREIGN_NOISE = 0.9, 0.75, 0.7
-"""Smallest parts of rows and of channels that differ in rows of another run, and smallest first difference over the
-noise; for independent noise it is 1.4."""
+"""Smallest parts of rows and of channels that differ in rows of another run, and smallest noise of the difference, by
+its second differences, over the noise; for independent noise it is 1.4."""
+_MIN_JUMP = 5.0
+"""Smallest jump at the first row of another run with the same noise, over the noise."""
 _EVEN_S = 1e-5
 """Standard deviation of shifts of edges that count as equal."""
 
@@ -192,8 +194,10 @@ def find_other_runs(
         at_once = len(rows) >= MIN_ROWS and len(rows) > _MIN_FOREIGN_PART * (rows[-1] - rows[0] + 1)
         for one, random in zip(part.channels, part.random, strict=True):
             if random and one.signal != "keyphasor":
-                off_v = one.scale * one.sensitivity_v * counts.get(one.name, np.zeros(1))[:MIN_ROWS]
-                differ.append(at_once and float(off_v.std()) + abs(off_v.mean()) > _MIN_FOREIGN_NOISE * one.noise_v)
+                off_v = one.scale * one.sensitivity_v * counts.get(one.name, np.zeros(3))[:MIN_ROWS]
+                noise = float(np.diff(off_v, 2).std()) / math.sqrt(6.0) if at_once and len(off_v) > 2 else 0.0
+                jumps = at_once and abs(off_v[0]) > _MIN_JUMP * one.noise_v
+                differ.append(bool(jumps or noise > _MIN_FOREIGN_NOISE * one.noise_v))
                 if one.unit == "mm" and not differ[-1]:
                     return []
                 if one.unit == "mm":
