@@ -16,6 +16,8 @@ import typer
 from rig.base.errors import InputError, Words
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from recorder.reader import Recording
     from rig.physics.parameters import ParameterSet
 
@@ -90,12 +92,15 @@ def split_names(text: str | None) -> list[str]:
     return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
-def subtract_run_out(text: str | None, *recordings: Recording, log: bool = False) -> list[Recording]:
-    """Return recordings without the run-out of a slow roll, and print what is subtracted.
+def subtract_run_out(
+    text: str | None, *recordings: Recording, show: Callable[[str], None], log: bool = False
+) -> list[Recording]:
+    """Return recordings without the run-out of a slow roll, and show what is subtracted.
 
     Args:
         text: Value of `--run-out`; None for none.
         recordings: The recordings.
+        show: Function that shows a line.
         log: Whether they must be logs, as the model contains the run-out of a recording of this rig.
 
     Raises:
@@ -105,7 +110,6 @@ def subtract_run_out(text: str | None, *recordings: Recording, log: bool = False
         return [*recordings]
     from recorder.reader import join
     from replays.plots.signals import subtract_runout
-    from rig.cli.output.tables import echo
 
     if log and (own := [one for one in recordings if "import" not in one.scene]):
         raise InputError("--run-out", "used with a log of another system", Words(str(own[0].path)))
@@ -117,7 +121,7 @@ def subtract_run_out(text: str | None, *recordings: Recording, log: bool = False
         raise InputError("--run-out", "a recording, with ascending times such as SLOW.mcap:1.5-9", text)
     slow = join([Path(match[1])])
     corrected = [subtract_runout(one, slow, orders=_RUNOUT_ORDERS, from_s=from_s, to_s=to_s) for one in recordings]
-    echo(corrected[0].correction[0], err=True)
+    show(corrected[0].correction[0])
     return corrected
 
 

@@ -48,7 +48,7 @@ BUDGETS = {
     "rig": 64,
     "rig/base": 1071,
     "rig/channels": 2591,
-    "rig/cli": 6229,
+    "rig/cli": 6235,
     "rig/ensemble": 2019,
     "rig/physics": 5488,
     "rig/run": 1896,

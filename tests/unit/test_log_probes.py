@@ -124,7 +124,7 @@ def test_a_log_without_the_run_out_of_its_slow_roll_passes(
 
 
 def test_run_out_is_subtracted_by_the_angle_where_samples_are_read(quiet: Recording, slow: Recording) -> None:
-    corrected = subtract_run_out(str(slow.path), quiet)[0]
+    corrected = subtract_run_out(str(slow.path), quiet, show=print)[0]
     before, after = (one.samples("disk_x", "ring_x") for one in (quiet, corrected))
     np.testing.assert_array_equal(before["ring_x"], after["ring_x"])
     turns = 6.2 * before.times_s
@@ -146,7 +146,7 @@ def test_both_recordings_of_a_comparison_are_corrected(
     assert abs(found[0]["a"] - found[1]["a"]) > 5e-4
     assert found[1]["a"] == found[1]["b"]
     assert err.count("run-out subtracted") == 1
-    (corrected,) = subtract_run_out(str(slow.path), quiet)
+    (corrected,) = subtract_run_out(str(slow.path), quiet, show=print)
     assert recording_origin("log", corrected)["correction"] in err  # in the head of reports
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -44,7 +45,7 @@ def compare(
         check_report(report, force=force)
     with reporting() as reporter:
         reporter.show("reading")
-        recordings = subtract_run_out(runout, join([first]), join([second]))
+        recordings = subtract_run_out(runout, join([first]), join([second]), show=partial(echo, err=True))
         reporter.show("comparing the phases")
         result = compare_recordings(*recordings)
         if report is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -179,7 +180,7 @@ def identify(
         check_set(output, force=force)
     if report is not None:
         check_report(report, force=force)
-    (recording,) = subtract_run_out(runout, join(files), log=True)
+    (recording,) = subtract_run_out(runout, join(files), log=True, show=partial(echo, err=True))
     name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
     with reporting(compiles=True) as reporter:
         identification, along = request.run(recording, search, exact=exact, progress=reporter.step)

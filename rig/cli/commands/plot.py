@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -39,7 +40,7 @@ def plot(
     check_folder(output, field="--output")
     bounds = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
-    (recording,) = subtract_run_out(runout, recording)
+    (recording,) = subtract_run_out(runout, recording, show=partial(echo, err=True))
     signals = read_signals(recording, from_s=from_s, to_s=to_s)
     pictures, written = list_pictures(signals, split_names(only)), list[Path]()
     left_out: dict[tuple[str, str], tuple[list[str], InputError]] = {}

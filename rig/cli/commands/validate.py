@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
@@ -100,7 +101,7 @@ def validate(
         return
     if output is not None:
         raise InputError("--output", "left out, except for a folder", str(output))
-    (recording,) = subtract_run_out(runout, join(files), log=True)
+    (recording,) = subtract_run_out(runout, join(files), log=True, show=partial(echo, err=True))
     with reporting(compiles=True) as reporter:
         result = hold(recording, step=reporter.step, budget=budget is not None, **options)
         origin = recording_origin(result.title, recording)
