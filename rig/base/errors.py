@@ -86,6 +86,10 @@ class DiskError(RuntimeError):
     """The disk refused during writing; the message says what is kept."""
 
 
+class MissingPackageError(ModuleNotFoundError):
+    """A package of an extra is not installed; the message has the command that installs it."""
+
+
 def describe_missing_package(error: ModuleNotFoundError) -> str | None:
     """Return the hint for a missing package of the extra `full`; None for any other."""
     if (name := (error.name or "").partition(".")[0]) not in FULL_PACKAGES:
@@ -101,13 +105,13 @@ def require_package(name: str, extra: str) -> Any:
         extra: Extra of this product that has it.
 
     Raises:
-        ModuleNotFoundError: It is not installed; the message has the command that installs it.
+        MissingPackageError: It is not installed.
     """
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
         line = f"{name} is not installed: pip install 'rotor-stator-rig[{extra}]'"
-        raise ModuleNotFoundError(line, name=name) from error
+        raise MissingPackageError(line, name=name) from error
 
 
 def is_full_missing() -> bool:

@@ -14,6 +14,7 @@ from rig.base.errors import (
     INSTALL_COMMAND,
     DiskError,
     InputError,
+    MissingPackageError,
     SimulationError,
     describe_missing_package,
     is_full_missing,
@@ -184,6 +185,8 @@ def start(arguments: list[str] | None = None) -> None:
         _fail(usage_error(error))
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", status=_INTERRUPTED)
+    except MissingPackageError as error:
+        _fail(str(error))
     except ModuleNotFoundError as error:
         if not (need := describe_missing_package(error)):
             raise

@@ -46,7 +46,7 @@ BUDGETS = {
     "replays/sessions": 77,
     "replays/studies": 9981,
     "rig": 64,
-    "rig/base": 1071,
+    "rig/base": 1072,
     "rig/channels": 2591,
     "rig/cli": 6235,
     "rig/ensemble": 2019,

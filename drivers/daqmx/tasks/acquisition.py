@@ -39,7 +39,7 @@ class Trigger:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What to acquire.
+    """Channels, rows and triggers of an acquisition.
 
     Attributes:
         columns: Number of channels that the program reads; the others are for triggers.
@@ -89,7 +89,7 @@ class Acquisition(Daq):
         self.acquired = 0
         """Samples that were put into the buffer."""
         self.complete = False
-        """Whether a finite acquisition has all of its samples."""
+        """True if a finite acquisition has all of its samples."""
         self.failure: tuple[Code, str] | None = None
         """Error that ended the acquisition."""
         super().__init__(source, channels=channels, rate_hz=rate_hz, buffer_s=plan.max_rows * plan.step / rate_hz)
@@ -101,7 +101,7 @@ class Acquisition(Daq):
 
     @property
     def done(self) -> bool:
-        """Whether no more samples will come."""
+        """True if no more samples will come."""
         return self.complete or self.failure is not None or self.ended is not None
 
     def wait(self, *, timeout_s: float | None = None) -> bool:

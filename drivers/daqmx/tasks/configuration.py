@@ -64,7 +64,7 @@ class Configuration:
         self.channels: list[VirtualChannel] = []
         self.settings = dict(DEFAULTS)
         self.started = False
-        """Whether the task runs, also without an acquisition."""
+        """True while the task runs, also without an acquisition."""
         self.changed = threading.Condition()
         """Notified at each start and stop; its lock is held while the task changes."""
 
@@ -81,7 +81,7 @@ class Configuration:
 
     @property
     def clocked(self) -> bool:
-        """Whether the task has a sample clock."""
+        """True if the task has a sample clock."""
         return bool(self.settings["SAMP_TIMING_TYPE"] == SampleTimingType.SAMPLE_CLOCK.value)
 
     def add(self, channels: list[VirtualChannel]) -> None:

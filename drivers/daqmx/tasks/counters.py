@@ -49,7 +49,7 @@ class Counter:
 
     @property
     def clocked(self) -> bool:
-        """Whether there is a value for each row, and not for each period."""
+        """True if there is a value for each row, and not for each period."""
         return self.usage is UsageTypeCI.COUNT_EDGES
 
     def feed(self, rows: Samples) -> np.ndarray:

@@ -84,7 +84,7 @@ class Task(Configuration):
 
     @property
     def done(self) -> bool:
-        """Whether no acquisition runs.
+        """Return whether no acquisition runs.
 
         Raises:
             DaqmxError: The acquisition ended by an error.
@@ -137,7 +137,7 @@ class Task(Configuration):
 
     @property
     def reads_newest(self) -> bool:
-        """Whether the task runs on demand."""
+        """True if the task runs on demand."""
         return self._plan.newest_only
 
     def read(self, count: int, timeout_s: float, active: Callable[[], bool]) -> tuple[Samples, int]:

@@ -228,7 +228,7 @@ class Bench(Closing):
 
     @property
     def daqmx_runs(self) -> bool | None:
-        """Whether a task of the NI-DAQmx server has run; None without a server."""
+        """Return whether a task of the NI-DAQmx server has run; None without a server."""
         return None if self._daqmx is None else self._daqmx.wait_for("rig: a task started", 0.0) is not None
 
     def begin(self) -> float:

@@ -149,7 +149,7 @@ def _list_steps(
 ) -> Iterator[np.ndarray]:
     """Yield the steps to try: fractions of the full one, then damped ones, each shape (keys,).
 
-    Where values nearly cancel, as force and length of a pulse, a small error of a slope turns the full step around.
+    A small error of a slope turns the full step around where values nearly cancel, as force and length of a pulse do.
     """
     off, deviations = priors
     curvature = sum(np.sum(a**2, axis=0) / max(1.0, rms(z)) ** 2 for z, a in zip(here.apart, here.slopes, strict=True))

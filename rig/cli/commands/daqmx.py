@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.base.errors import InputError, RefusedError
+from rig.base.errors import InputError, require_package
 from rig.base.text import printable
 from rig.cli.connections.connection import Connection
 from rig.cli.output.tables import echo
@@ -38,10 +38,10 @@ def daqmx(
         raise InputError("--device", "letters, digits and _", printable(device))
     address = f"127.0.0.1:{port}"
     check_free(parse_loopback(address, field="--port", least=0), field="--port")
-    try:
-        from drivers.daqmx.server import DaqmxServer
-    except ModuleNotFoundError as error:
-        raise RefusedError(f"rig daqmx needs {error.name}: pip install 'rotor-stator-rig[nidaqmx]'") from None
+    for package in ("nidaqmx", "grpc"):
+        require_package(package, "nidaqmx")
+    from drivers.daqmx.server import DaqmxServer
+
     done = threading.Event()
     with (
         connection.client() as client,

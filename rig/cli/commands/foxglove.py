@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from rig.base.errors import InputError, RefusedError, require_package
+from rig.base.errors import InputError, require_package
 from rig.base.files import check_new_file, write_file
 from rig.cli.connections.connection import Connection
 from rig.cli.options import Force
@@ -49,10 +49,7 @@ def foxglove(
     if layout is not None:
         _write_layout(layout, replay, force=force)
         return
-    try:
-        require_package("foxglove", "foxglove")
-    except ModuleNotFoundError as error:
-        raise RefusedError(f"rig foxglove: {error}") from None
+    require_package("foxglove", "foxglove")
     address = parse_loopback(listen, field="--listen", least=0)
     check_free(address, field="--listen")
     check_view_rate(view_rate_hz)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.base.errors import InputError, RefusedError, Words, require_package
+from rig.base.errors import InputError, Words, require_package
 from rig.cli.connections.connection import Connection
 from rig.cli.options import ChannelFile
 from rig.cli.output.tables import Form, echo, echo_document, echo_json, new_table
@@ -48,10 +48,7 @@ def modbus(
         return
     if channels is not None or markdown or form.as_json:
         raise InputError("--channels, --markdown and --json", "given with --map", Words("no --map"))
-    try:
-        require_package("pymodbus", "modbus")
-    except ModuleNotFoundError as error:
-        raise RefusedError(str(error)) from None
+    require_package("pymodbus", "modbus")
     _serve(listen, settings, connection, allow_commands=allow_commands)
 
 
