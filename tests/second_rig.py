@@ -68,7 +68,7 @@ class Rig(NamedTuple):
     P0: float = 3000.0
     g: float = 9.81
     exponent: float = 1.5
-    late: bool = False  # each contact begins at the first multiple of 2 us inside the ring
+    late: int = 0  # steps of 0.5 us after which each contact begins
 
 
 @njit(cache=True)
@@ -146,14 +146,15 @@ def _step(rig, t, h, omega0, pulse, v0, y, work):
 
 @njit(cache=True)
 def _run(rig, y, omega0, pulse, t0, steps, every, rows):
-    work, h, v0, contacts = np.empty((6, 15)), STEP_S, 0.0, 0
+    work, h, v0, contacts, inside = np.empty((6, 15)), STEP_S, 0.0, 0, 0
     for n in range(steps):
         t, part = t0 + n * h, 0.0
         inputs = rows[n // every] if n % every == 0 else work[5]
         _rates(rig, t, omega0, pulse, v0, y, work[0], inputs)
         ahead = _step(rig, t, h, omega0, pulse, v0, y, work)
         depth, rate = _rates(rig, t + h, omega0, pulse, v0, ahead, work[0], work[5])
-        if depth > 0.0 and v0 == 0.0 and not (rig.late and (n + 1) % 4):
+        inside = inside + 1 if depth > 0.0 and v0 == 0.0 else 0
+        if inside > rig.late:
             low, part = 0.0, 1.0
             for _ in range(0 if rig.late else 50):
                 middle = 0.5 * (low + part)

@@ -353,6 +353,11 @@ def input_error(error: ValidationError, field_prefix: str, model: type[BaseModel
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ").partition(", unable")[0]
     message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
     message = message.partition(" after validation, not ")[0]
+    message += "".join(  # words that the field accepts in addition to the first kind of value
+        f" or {other.get('ctx', {}).get('expected')}"
+        for other in error.errors()[1:]
+        if other["type"] == "literal_error" and other["loc"][:-1] == first["loc"][:-1]
+    )
     if first["type"] == "union_tag_invalid":
         context = first.get("ctx", {})
         name = str(context.get("discriminator")).strip("'")

@@ -77,22 +77,22 @@ class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         _, least, most = ORDERS[self.filter]
         if not least <= self.filter_order <= most:
             must = f"from {least} to {most} for the filter {self.filter}"
-            raise InputError(f"channel {self.name}.filter_order", must, self.filter_order)
+            raise InputError("filter_order", must, self.filter_order)
         if self.group_delay_us is not None and self.filter not in LINEAR_PHASE:
             must = f"left out, as the filter {self.filter} is not one of {', '.join(LINEAR_PHASE)}"
-            raise InputError(f"channel {self.name}.group_delay_us", must, self.group_delay_us)
+            raise InputError("group_delay_us", must, self.group_delay_us)
         return self
 
     @model_validator(mode="after")
     def _check_scale(self) -> Channel:
         if self.sensitivity_v == 0.0:
-            raise InputError(f"channel {self.name}.sensitivity_v", "non-zero", self.sensitivity_v)
+            raise InputError("sensitivity_v", "non-zero", self.sensitivity_v)
         low, high = self.range_v
         if not -self.adc_v <= low < high <= self.adc_v:
             must = f"two ascending values inside +-adc_v ({self.adc_v:g} V)"
-            raise InputError(f"channel {self.name}.range_v", must, self.range_v)
+            raise InputError("range_v", must, self.range_v)
         if not (math.isfinite(self.scale) and self.scale and math.isfinite(self.offset)):
-            raise InputError(f"channel {self.name}.sensitivity_v", "one that gives a finite scale", self.sensitivity_v)
+            raise InputError("sensitivity_v", "one that gives a finite scale", self.sensitivity_v)
         return self
 
     @property

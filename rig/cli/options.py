@@ -87,9 +87,16 @@ class SceneChanges:
         return overrides | {key: str(value) for key, value in named.items() if value is not None}
 
 
-def split_names(text: str | None) -> list[str]:
-    """Return the names of a comma-separated list; empty for None."""
-    return [name.strip() for name in (text or "").split(",") if name.strip()]
+def split_names(text: str | None, option: str) -> list[str]:
+    """Return the names of a comma-separated list, the value of an option; empty for None.
+
+    Raises:
+        InputError: The list is empty.
+    """
+    names = [name.strip() for name in (text or "").split(",") if name.strip()]
+    if text is not None and not names:
+        raise InputError(option, "one or more names, separated by commas", text)
+    return names
 
 
 def subtract_run_out(

@@ -722,6 +722,14 @@ def test_an_incomplete_hammer_pulse_is_reported(tmp_path: Path) -> None:
         imported(tmp_path, [path], f"[time]\nfrom_s = 1.0\n{HAMMER_MAPPING}", name="after")
 
 
+def test_doubtful_lines_of_a_mapping_are_remarked(tmp_path: Path) -> None:
+    path = hammer_log(tmp_path / "x.csv", at_s=0.73211, force_n=87.0, duration_s=6.5e-3)
+    mapping = HAMMER_MAPPING.replace("pre_s = 0.25", "pre_s = 7").replace('"disk_x"', '"speed"\nunit = "mm"')
+    conversion, _ = imported(tmp_path, [path], mapping)
+    assert "the log has 0.7321 s before the first hammer pulse, less than hammer.pre_s = 7 s" in conversion.remarks
+    assert "disk_x and speed have the same source, speed" in conversion.remarks
+
+
 def rows_of(path: Path, lines: list[str]) -> Path:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
@@ -872,6 +880,17 @@ X = '[channels.disk_x]\nsource = "x"\n'
         (
             "[[rotate]]\nchannels = ['disk_x', 'disk_y']\nangles_deg = [0, 90]\n" + X,
             "m.toml: rotate.channels must be mapped",
+        ),
+        (X + "ripple_db = 2\n", "m.toml: channels.disk_x.ripple_db must be left out with the filter butterworth"),
+        (
+            "[defaults]\nfilter = 'none'\n" + X + "filter_order = 2\n",
+            "m.toml: channels.disk_x.filter_order must be left out with the filter none",
+        ),
+        (X + "unit = 'mm'\nfilter_order = 9\n", "m.toml: channels.disk_x.filter_order must be from 1 to 8"),
+        (X + "bias = 'men'\n", "m.toml: channels.disk_x.bias must be a valid number or 'mean'"),
+        (
+            "[experiment]\nscene = 'drop'\ncommands = 'detect'\n" + X,
+            "m.toml: experiment.commands must be a list or 'scene' or 'detected'; received 'detect'",
         ),
         ("[experiment]\nscene = 'dance'\n" + X, "scene must be one of"),
         ("[experiment]\nscene = 'drop'\nset = { 'contact.frictoin' = 1 }\n" + X, "contact.frictoin must be"),

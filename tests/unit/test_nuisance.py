@@ -158,7 +158,7 @@ def draw_wrong_contact(seed: int) -> second_rig.Rig:
     rng, right = np.random.default_rng(8000 + seed), second_rig.Rig()
     sign = rng.choice([-1.0, 1.0])
     changes: list[dict[str, Any]] = [
-        {"late": True},
+        {"late": int(rng.integers(10, 41))},
         {"exponent": 1.5 + sign * rng.uniform(0.01, 0.06)},
         {"c": right.c * (1.0 + 0.3 * sign)},
         {"mu": right.mu * (1.0 + sign * rng.uniform(0.005, 0.1))},

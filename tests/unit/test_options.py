@@ -64,8 +64,11 @@ def test_one_option_has_one_name_in_all_commands() -> None:
 
 
 def test_names_and_pairs() -> None:
-    assert split_names(None) == split_names(" , ") == []
-    assert split_names("a, b,,c") == ["a", "b", "c"]
+    assert split_names(None, "--only") == []
+    assert split_names("a, b,,c", "--only") == ["a", "b", "c"]
+    for none in ("", " , "):
+        with pytest.raises(InputError, match="--only must be one or more names, separated by commas"):
+            split_names(none, "--only")
     assert parse_pairs("--set", None, "KEY=VALUE") == {}
     assert parse_pairs("--set", ["a = 1", "b=c=d"], "KEY=VALUE") == {"a": "1", "b": "c=d"}
     for wrong in ("a", "=1", "a=", " = "):

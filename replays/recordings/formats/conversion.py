@@ -105,6 +105,10 @@ def convert(
     remarks += doubts
     say("reading")
     signals = [log.take(name, wanted) for name, wanted in mapping.channels.items()]
+    uses: dict[tuple[Path, str | None, str], list[str]] = {}
+    for one in signals:
+        uses.setdefault((one.source.path, one.entry.group, one.entry.name), []).append(one.name)
+    remarks += [f"{' and '.join(names)} have the same source, {key[-1]}" for key, names in uses.items() if names[1:]]
     say("aligning")
     log.align()
     for entry in signals:
@@ -265,7 +269,7 @@ def _range(signals: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse
             raise InputError("hammer.threshold_n", f"below the largest force, {largest:.3g} N, in what is imported",
                              mapping.hammer.threshold_n)  # fmt: skip
         first_pulses = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in pulses[:5])
-        log.remarks.append(f"{len(pulses)} hammer pulses found: {first_pulses}")
+        log.remarks.append(f"found hammer pulses ({len(pulses)}): {first_pulses}")
         log.remarks += [
             f"the hammer pulse at {pulse.at_s:.4f} s is incomplete, as the log begins or ends there, or samples "
             "are missing: its force and duration are wrong"
@@ -274,7 +278,7 @@ def _range(signals: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse
         ]
         if lost := [f"{b.force_n:.4g} N at {b.at_s:.4f} s" for b in passed_over if low <= b.at_s <= high]:
             log.remarks.append(
-                f"{len(lost)} hammer pulses ignored, as too soon after another; predictions do not include "
+                f"ignored hammer pulses ({len(lost)}), as too soon after another: predictions do not include "
                 f"them (hammer.dead_s, hammer.threshold_n): {', '.join(lost[:5])}"
             )
         for second in pulses[1:2]:
@@ -285,6 +289,11 @@ def _range(signals: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse
             )
         if mapping.hammer.pre_s is not None:
             low = max(low, pulses[0].at_s - mapping.hammer.pre_s)
+            if (before_s := pulses[0].at_s - hammer.axis.first_s) < mapping.hammer.pre_s - 1.0 / hammer.axis.rate_hz:
+                log.remarks.append(
+                    f"the log has {before_s:.4g} s before the first hammer pulse, less than hammer.pre_s = "
+                    f"{mapping.hammer.pre_s:g} s"
+                )
     return pulses, low, high
 
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, f
 from rig.base import units
 from rig.base.checks import check, read_toml
 from rig.base.errors import InputError, Words
-from rig.channels.table import FilterKind
+from rig.channels.table import LINEAR_PHASE, ORDERS, FilterKind
 
 _EPOCH = re.compile(r"\b(unix|epoch|posix|since|from|the|1970(-01-01)?|utc)\b", re.IGNORECASE)
 """Words for the origin of a time scale, which do not affect its unit."""
@@ -142,6 +142,13 @@ class SignalName(_Section):
     """Group in the file, if the name is ambiguous."""
     file: str | None = None
     """File name, if there are several files."""
+
+
+USED_BY = {
+    "filter_order": [kind for kind in ORDERS if kind != "none"], "ripple_db": ["chebyshev"],
+    "group_delay_us": LINEAR_PHASE,
+}  # fmt: skip
+"""Kinds of filter that have a field of `LowPass`."""
 
 
 class LowPass(_Section):
@@ -337,6 +344,11 @@ def parse_mapping(data: dict[str, Any], *, name: str) -> Mapping:
     channels = {}
     for channel, entry in mapping.channels.items():
         shape = entry.shape if entry.filter else mapping.defaults.shape | entry.shape
+        kind = shape.get("filter", "butterworth")
+        for key, kinds in USED_BY.items():
+            if key in shape and kind not in kinds:
+                must = f"left out with the filter {kind}"
+                raise InputError(f"{name}: channels.{channel}.{key}", must, shape[key])
         corner_hz = entry.bandwidth_hz or mapping.defaults.bandwidth_hz
         channels[channel] = entry.model_copy(update=shape | {"bandwidth_hz": corner_hz})
         if entry.bandwidth_hz is None:

@@ -234,7 +234,8 @@ def read_measured(recording: Recording, scene: Scene, *, longest_s: float = math
 
 
 _SPEEDS = [COLUMN[name] for name in ("vx_ih", "vy_ih", "vx_oh", "vy_oh")]
-_ACCELERATIONS = [COLUMN[name] for name in ("inner_ax", "inner_ay", "outer_ax", "outer_ay")]
+_ACCELERATION_NAMES = ("inner_ax", "inner_ay", "outer_ax", "outer_ay")
+_ACCELERATIONS = [COLUMN[name] for name in _ACCELERATION_NAMES]
 
 
 @dataclass(frozen=True)
@@ -297,7 +298,8 @@ class _Channels:
             columns=formulas.columns(groups),
         )  # fmt: skip
         self._formulas, self._last, self._rows = formulas, np.empty((0, 0)), np.empty((0, 0))
-        self._from_speeds = from_speeds
+        signals = [channel.signal for part in parts for channel in part.channels]
+        self._from_speeds = from_speeds and any(name in signal for name in _ACCELERATION_NAMES for signal in signals)
         self._counts: dict[str, list[np.ndarray]] = {part.group: [] for part in parts}
         self._first = 0
 

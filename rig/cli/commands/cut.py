@@ -44,7 +44,7 @@ def cut(
             from_s=-math.inf if from_s is None else from_s,
             to_s=math.inf if to_s is None else to_s,
             only=None if only is None else Only(only).value,
-            channels=tuple(split_names(channels)),
+            channels=tuple(split_names(channels, "--channels")),
             force=force,
             on_progress=lambda done: report.part(done, f"writing {output}"),
         )

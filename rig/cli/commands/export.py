@@ -55,7 +55,7 @@ def export(
     bounds = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
     selection = select(
-        recording, channels=split_names(channels), truth=truth, unit=unit, from_s=from_s, to_s=to_s,
+        recording, channels=split_names(channels, "--channels"), truth=truth, unit=unit, from_s=from_s, to_s=to_s,
         merged=holds_one_table(output),
     )  # fmt: skip
     with reporting() as reporter:

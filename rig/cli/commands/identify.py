@@ -83,14 +83,15 @@ class FitRequest:
         from replays.recordings.resimulation.experiment import is_imported
         from replays.recordings.validation import load_criteria
 
-        keys = [key for part in self.fit for key in split_names(part)]
+        keys = [key for part in self.fit for key in split_names(part, "--fit")]
         experiment, along = self._experiment(recording), dict[str, tuple[float, float] | None]()
         prior_texts = parse_pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
         priors = {key: _parse_pair("prior", text, "+-") for key, text in prior_texts.items()}
         starts = {key: _number("start", text) for key, text in parse_pairs("--start", self.start, "KEY=VALUE").items()}
         limits = parse_pairs("--bounds", self.bounds, "KEY=LOW:HIGH")
         bounds = {key: _parse_pair("bounds", text, ":") for key, text in limits.items()}
-        setup: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": split_names(self.channels) or None}
+        channels = split_names(self.channels, "--channels") or None
+        setup: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": channels}
         if is_imported(recording) and not exact:
             if first_command_s(experiment) > 0.0:
                 search.check_unused(from_s=self.from_s)

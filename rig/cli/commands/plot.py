@@ -42,7 +42,7 @@ def plot(
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
     (recording,) = subtract_run_out(runout, recording, show=partial(echo, err=True))
     signals = read_signals(recording, from_s=from_s, to_s=to_s)
-    pictures, written = list_pictures(signals, split_names(only)), list[Path]()
+    pictures, written = list_pictures(signals, split_names(only, "--only")), list[Path]()
     left_out: dict[tuple[str, str], tuple[list[str], InputError]] = {}
     with reporting() as reporter:
         reporter.begin(len(pictures))

@@ -92,7 +92,7 @@ class ReplayEdit:
         return Edit(
             track.documents[CATALOGUE],
             keys=parse_pairs("--remap", self.remap, "KEY=KEY"),
-            channels=None if self.channels is None else split_names(self.channels),
+            channels=None if self.channels is None else split_names(self.channels, "--channels"),
             names=parse_pairs("--rename", self.rename, "NAME=NAME"),
             truth=self.only is None,
         )

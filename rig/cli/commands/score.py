@@ -100,7 +100,7 @@ def score(
             check_output_differs([file, *(against or ())], target, field=field)
     score_limits = load_limits(limits)
     mapped = None if mapping is None else load_mapping(mapping)
-    due = None if channels is None else split_names(channels)
+    due = None if channels is None else split_names(channels, "--channels")
     method = None if path is None else "digital" if path is _Method.DIGITAL else "analogue"
     live = str(file) == "-"
     if live == (against is not None):

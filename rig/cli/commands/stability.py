@@ -72,7 +72,7 @@ def stability(
         if not scenes:
             raise InputError("--law", "given with --scenes", str(law))
         name = add_law_scene(law)
-        only = only and ",".join(name if part == "law" else part for part in split_names(only))
+        only = only and ",".join(name if part == "law" else part for part in split_names(only, "--only"))
     names = select_engines(engines)
     if scenes:
         _twelve(only, None if engines is None else names, output, form)

@@ -88,7 +88,7 @@ def validate(
     if budget is not None:
         check_report(budget, force=force, field="--budget", suffixes=TEXT_SUFFIXES)
     rules = load_criteria(criteria)
-    rules = rules.with_floating((*rules.floating, *split_names(floating)))
+    rules = rules.with_floating((*rules.floating, *split_names(floating, "--float")))
     texts = SceneChanges(changes=changes, engine=engine).overrides()
     overrides = {key: read_value(value) for key, value in texts.items()}
     options: dict[str, Any] = {"criteria": rules, "changes": overrides, "declared": declared, "blind": blind}
