@@ -29,9 +29,18 @@ class DaqmxServer(Closing):
         port: Port on 127.0.0.1; 0: any free one.
         device: Name of the device.
         allow_commands: Whether outputs command the rig.
+        secret: Required in the metadata of calls for outputs; None: they need none.
     """
 
-    def __init__(self, client: Client, *, port: int = 0, device: str = "rig", allow_commands: bool = False) -> None:
+    def __init__(
+        self,
+        client: Client,
+        *,
+        port: int = 0,
+        device: str = "rig",
+        allow_commands: bool = False,
+        secret: str | None = None,
+    ) -> None:
         stream = RigStream(client)
         self.device = Device(device, stream.table())
         """The device."""
@@ -44,7 +53,7 @@ class DaqmxServer(Closing):
             self.task_started.set()
             return RigSource(client, stream=stream, counts=True)
 
-        self._servicer = DaqmxServicer(self.device, outputs, open_source)  # pyrefly: ignore[bad-instantiation]
+        self._servicer = DaqmxServicer(self.device, outputs, open_source, secret)  # pyrefly: ignore[bad-instantiation]
         self._pool = ThreadPoolExecutor(_MAX_CALLS, thread_name_prefix="daqmx")
         self._server = grpc.server(self._pool, options=[("grpc.so_reuseport", 0), ("grpc.max_send_message_length", -1)])
         add_NiDAQmxServicer_to_server(self._servicer, self._server)

@@ -7,6 +7,7 @@ each command as from every other client.
 from __future__ import annotations
 
 import json
+import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -64,6 +65,7 @@ class FoxgloveServer(Closing):
         send: Sends commands to the rig.
         allow_commands: Accept the services; otherwise they answer with an error.
         allow_playback: Accept the play bar of a replay.
+        secret: Required as the field `secret` of the services' requests; None: they need none.
 
     Raises:
         InputError: The address is in use.
@@ -80,12 +82,13 @@ class FoxgloveServer(Closing):
         send: Send,
         allow_commands: bool,
         allow_playback: bool,
+        secret: str | None = None,
     ) -> None:
         sdk = require_package("foxglove", "foxglove")
         from foxglove.websocket import Capability
 
         self._client, self._send, self._view_rate_hz = client, send, view_rate_hz
-        self._allow_commands = allow_commands
+        self._allow_commands, self._secret = allow_commands, secret
         self._inbox = BoundedQueue[tuple[str, bytes]](_QUEUE_BYTES, size=lambda item: len(item[1]))
         self._context = sdk.Context()
         self._channels: dict[str, Channel] = {}
@@ -256,7 +259,8 @@ class FoxgloveServer(Closing):
             return MessageSchema(encoding="json", schema=schema)
 
         reply = {"command": {"type": "string"}, "id": {"type": "integer"}, "tick": {"type": "integer"}}
-        given = ServiceSchema(name, request=form(name, describe_fields(name)), response=form(f"{name} reply", reply))
+        fields = describe_fields(name) | ({} if self._secret is None else {"secret": {"type": "string"}})
+        given = ServiceSchema(name, request=form(name, fields), response=form(f"{name} reply", reply))
         return Service(name, schema=given, handler=self._call)
 
     def _call(self, request: ServiceRequest) -> bytes:
@@ -265,6 +269,10 @@ class FoxgloveServer(Closing):
         if not self._allow_commands:
             raise RefusedError(f"{name} is refused: this server was started without --allow-commands")
         fields = read_json(request.payload or b"{}", field=name, most_bytes=REQUEST_BYTES)
+        if self._secret is not None:
+            given = str(fields.pop("secret", "")).encode(errors="replace")
+            if not secrets.compare_digest(given, self._secret.encode()):
+                raise RefusedError(f"{name} is refused: the field secret must be that of `rig foxglove --secret FILE`")
         for own in {"from", "rig"} & fields.keys():
             raise InputError(f"{name}.{own}", "left out", fields[own])
         return json.dumps(asdict(self._send(name, **fields))).encode()

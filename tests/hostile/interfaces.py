@@ -283,6 +283,30 @@ class Interfaces:
 
         return Interface(generate, use, BATCH)
 
+    def daqmx(self) -> Interface:
+        """Generate calls of programs to the NI-DAQmx device, without its sockets."""
+        from tests.hostile.daqmx import generate_calls, pass_calls
+
+        def generate(rng: Rng) -> tuple[str, bytes]:
+            return ".txt", "\n".join(f"{name} {data.hex()}" for name, data in generate_calls(rng, BATCH)).encode()
+
+        def use(path: Path) -> None:
+            lines = [line.split(" ") for line in path.read_text().splitlines()]
+            for with_secret in (False, True):
+                pass_calls(((name, bytes.fromhex(data)) for name, data in lines), with_secret=with_secret)
+
+        return Interface(generate, use, BATCH)
+
+    def foxglove(self) -> Interface:
+        """Generate messages of clients to the server for the Foxglove app."""
+        from tests.hostile.foxglove import decode_messages, encode_messages, generate_messages, pass_messages
+
+        return Interface(
+            lambda rng: (".json", encode_messages(generate_messages(rng, BATCH))),
+            lambda path: pass_messages(decode_messages(path.read_bytes())),
+            BATCH,
+        )
+
     # ---- files ----
 
     def session(self) -> Path:
@@ -451,7 +475,9 @@ _SUFFIXES = {
     "parquet": (".parquet",), "wav": (".wav", ".wav.json"), "mdf": (".mf4",), "tdms": (".tdms",), "uff": (".uff",),
     "text": (".csv", ".lvm"),
 }  # fmt: skip
-NAMES = ("campaigns", "results", "limits", "lockstep", "can_lockstep", "can_logs", "events", *_SUFFIXES)
+NAMES = (
+    "campaigns", "results", "limits", "lockstep", "can_lockstep", "can_logs", "events", "daqmx", "foxglove", *_SUFFIXES,
+)  # fmt: skip
 """Names of all interfaces."""
 WRITTEN = {".parquet": "parquet", ".mf4": "mdf", ".tdms": "tdms", ".uff": "uff", ".csv": "comma"}
 """Formats that `write_odd` writes, by suffix."""

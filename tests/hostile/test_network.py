@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections import Counter
 from typing import Any
 
 import can  # noqa: TID253 - the subject
+import grpc
+import nidaqmx
 import numpy as np
 import pytest
 
@@ -20,6 +23,7 @@ from drivers.can.bus.model import BusModel
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
 from drivers.can.signals import default_messages
+from drivers.daqmx.server import DaqmxServer
 from drivers.instruments.twins import TWINS, Twins
 from drivers.link.zenoh import request_key
 from drivers.sources.can_client import CanClient
@@ -28,12 +32,14 @@ from rig.serve.transport import NoReplyError
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.hostile import input_count
+from tests.hostile.daqmx import STREAMS, generate_calls
 from tests.hostile.documents import generate_documents
 from tests.hostile.interfaces import ask, make_frame_line, make_request, serve_lockstep
 from tests.hostile.test_can import make_offer
 from tests.hostile.test_can import make_request as make_instrument_request
 from tests.processes import free_endpoint
 from tests.unit.instruments_fake import FakeRig
+from tests.unit.test_daqmx import PlayedRig
 from tests.waiting import until
 
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(3600)]
@@ -91,6 +97,40 @@ def test_frames_in_lockstep_and_messages_to_a_hub_over_zenoh() -> None:
             assert not any("failed" in text for text in hub.warnings())
             assert service.status()["state"] == "running"
             assert any(thread.name == "can hub can0" for thread in threading.enumerate())
+
+
+def test_calls_to_a_daqmx_device_over_grpc(caplog: pytest.LogCaptureFixture) -> None:
+    rng, rig = np.random.default_rng(24), PlayedRig()
+    codes, others = Counter[grpc.StatusCode](), list[tuple[str, grpc.StatusCode]]()
+    with (
+        DaqmxServer(rig, allow_commands=True, secret="s") as server,  # type: ignore[arg-type]
+        grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel,
+    ):
+        for name, payload in generate_calls(rng, input_count(300)):
+            if name == "BLOCK":
+                continue
+            call = channel.unary_stream if name in STREAMS else channel.unary_unary
+            try:
+                reply = call(f"/nidaqmx_grpc.NiDAQmx/{name}")(payload, timeout=0.5)
+                codes[grpc.StatusCode.OK] += 1
+                if name in STREAMS:
+                    reply.cancel()
+            except grpc.RpcError as error:
+                codes[error.code()] += 1
+                if "ni-error" not in dict(error.trailing_metadata()):
+                    others.append((name, error.code()))
+        with nidaqmx.Task(grpc_options=nidaqmx.GrpcSessionOptions(channel, "")) as task:
+            task.ai_channels.add_ai_voltage_chan("rig/ai0:14")
+            task.timing.cfg_samp_clk_timing(20_000.0, samps_per_chan=200)
+            task.start()
+            rig.send(0)
+            np.testing.assert_array_equal(np.shape(task.read(200)), (15, 200))
+    assert not rig.commands
+    for name, code in others:  # a read that waits, or bytes that are no message
+        assert code is grpc.StatusCode.INTERNAL or (code is grpc.StatusCode.DEADLINE_EXCEEDED and "Read" in name), name
+    assert min(codes[code] for code in (grpc.StatusCode.OK, grpc.StatusCode.UNKNOWN)) > 30
+    assert codes[grpc.StatusCode.PERMISSION_DENIED] > 10
+    assert not [record for record in caplog.records if "deserializing" not in record.getMessage()]
 
 
 def test_requests_to_instruments_over_zenoh() -> None:

@@ -26,6 +26,7 @@ EXCEPTIONS = {
     "rig/run/offline.py:array": _DRAFT,
     "rig/run/scenes.py:scene_document": _INTERNAL,
     "rig/serve/transport/exposure/certificates.py": "new folders of unguessable names, readable by their owner only",
+    "rig/serve/transport/exposure/secret.py": "created exclusively, and private to its owner from the start",
     "rig/serve/transport/names.py": _LOCK,
     "drivers/link/serial.py:open_serial": _LOCK,
     "recorder/contents/consistency.py:_load_json": "values that are only compared; text that is not JSON has none",

@@ -23,7 +23,7 @@ SLACK = 50
 BUDGETS = {
     "drivers": 714,
     "drivers/can": 4538,
-    "drivers/daqmx": 1333,
+    "drivers/daqmx": 1383,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
@@ -32,7 +32,7 @@ BUDGETS = {
     "recorder": 1358,
     "recorder/contents": 1268,
     "recorder/files": 831,
-    "recorder/foxglove": 311,
+    "recorder/foxglove": 318,
     "recorder/output": 544,
     "recorder/viewer": 1928,
     "replays": 0,
@@ -48,11 +48,11 @@ BUDGETS = {
     "rig": 64,
     "rig/base": 1077,
     "rig/channels": 2591,
-    "rig/cli": 6235,
+    "rig/cli": 6255,
     "rig/ensemble": 2019,
     "rig/physics": 5488,
     "rig/run": 1896,
-    "rig/serve": 3020,
+    "rig/serve": 3047,
 }
 _NO_CODE = (
     tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER,

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import stat
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from rig.serve.transport.exposure.certificates import (
     read_holder,
     remove_holder,
 )
+from rig.serve.transport.exposure.secret import read_secret
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -245,3 +247,41 @@ def test_the_url_of_a_daq_names_its_keys_too(tmp_path: Path) -> None:
         open_source(f"zenoh:127.0.0.1:7463?tls={tmp_path}/nowhere")
     with pytest.raises(InputError, match=r"^connect must be HOST:PORT"):
         open_source("zenoh:127.0.0.1?tls=keys")
+
+
+def test_the_secret_of_a_file_is_created_once_and_private(tmp_path: Path) -> None:
+    path = tmp_path / "secret.txt"
+    secret = read_secret(path)
+    assert (len(secret), path.read_text(), path.stat().st_mode & 0o777) == (32, f"{secret}\n", 0o600)
+    assert read_secret(path) == secret
+    path.chmod(0o640)
+    with pytest.raises(InputError, match="private to its owner"):
+        read_secret(path)
+    other = tmp_path / "notes.txt"
+    other.write_text("mine")
+    with pytest.raises(InputError, match="32 hexadecimal digits"):
+        read_secret(other)
+    assert other.read_text() == "mine"
+    for wrong in (tmp_path, tmp_path / "none" / "secret.txt"):
+        with pytest.raises(InputError, match="--secret must be"):
+            read_secret(wrong)
+
+
+@pytest.mark.parametrize("command", ["daqmx", "foxglove"])
+@pytest.mark.parametrize(
+    ("options", "must"),
+    [
+        (("--secret", "new.txt"), "--secret must be given with --allow-commands"),
+        (("--allow-commands", "--tls", "keys/operator"), "--allow-commands must be given with --secret FILE"),
+    ],
+)
+def test_commands_with_a_certificate_need_a_secret(
+    command: str, options: tuple[str, ...], must: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip({"daqmx": "nidaqmx"}.get(command, command))
+    address = ("--port", "0") if command == "daqmx" else ("--listen", "127.0.0.1:0")
+    with pytest.raises(SystemExit) as end, contextlib.chdir(tmp_path):
+        main([command, *address, *options])
+    error = capsys.readouterr().err
+    assert (end.value.code, error.count("\n"), must in error) == (2, 1, True), error
+    assert not list(tmp_path.iterdir())

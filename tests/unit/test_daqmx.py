@@ -14,9 +14,15 @@ import numpy as np
 import pytest
 from nidaqmx import GrpcSessionOptions
 from nidaqmx._stubs import nidaqmx_pb2  # noqa: PLC2701
+from nidaqmx._stubs.nidaqmx_pb2_grpc import NiDAQmxStub  # noqa: PLC2701
 from nidaqmx.constants import AccelUnits, AcquisitionType, Edge, LineGrouping, Slope
 from nidaqmx.error_codes import DAQmxErrors
-from nidaqmx.stream_readers import AnalogMultiChannelReader, AnalogUnscaledReader, CounterReader
+from nidaqmx.stream_readers import (
+    AnalogMultiChannelReader,
+    AnalogUnscaledReader,
+    CounterReader,
+    DigitalSingleChannelReader,
+)
 from nidaqmx.system import System
 from nitypes.waveform import DigitalWaveform
 
@@ -297,6 +303,53 @@ def test_digital_inputs_are_the_signals_of_the_rig(rig: PlayedRig, task: nidaqmx
     assert (np.flatnonzero(hammer)[[0, -1]].tolist(), np.flatnonzero(keyphasor)[0]) == ([50, 54], 150)
 
 
+def test_a_clocked_line_without_samples_is_a_timeout(task: nidaqmx.Task) -> None:
+    task.di_channels.add_di_chan("rig/port1/line0")
+    task.timing.cfg_samp_clk_timing(20_000.0)
+    with pytest.raises(nidaqmx.DaqError, match="-200284"):
+        DigitalSingleChannelReader(task.in_stream).read_one_sample_port_uint32(timeout=0.0)
+
+
+def test_large_messages_are_refused_before_they_need_memory(rig: PlayedRig) -> None:
+    with (
+        DaqmxServer(rig, allow_commands=True) as server,
+        grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel,
+        nidaqmx.Task(grpc_options=GrpcSessionOptions(channel, "")) as task,
+        nidaqmx.Task(grpc_options=GrpcSessionOptions(channel, "")) as lines,
+        nidaqmx.Task(grpc_options=GrpcSessionOptions(channel, "")) as drive,
+    ):
+        for name in ("1" * 2000, ",".join(["rig/ai0:14998"] * 20)):
+            with pytest.raises(nidaqmx.DaqError, match="at most 1024 characters with 16 colons"):
+                task.ai_channels.add_ai_voltage_chan(name)
+        with refused(DAQmxErrors.INVALID_ATTRIBUTE_VALUE):
+            task.ai_channels.add_ai_accel_chan("rig/ai10", sensitivity=5e-324)
+        task.ai_channels.add_ai_voltage_chan("rig/ai0:14")
+        with refused(DAQmxErrors.PAL_MEMORY_FULL):
+            task.read(1_000_000, timeout=0.0)
+        lines.do_channels.add_do_chan("rig/port0/line0:1", line_grouping=LineGrouping.CHAN_FOR_ALL_LINES)
+        drive.ao_channels.add_ao_voltage_chan("rig/ao0")
+        for output, samples in ((lines, [1] * 10_001), (drive, [1.0] * 10_001)):
+            with pytest.raises(nidaqmx.DaqError, match="at most 10000 without a sample clock"):
+                output.write(samples, auto_start=True)
+    assert not rig.commands
+
+
+def test_a_clocked_output_that_is_stopped_early_leaves_no_thread(rig: PlayedRig) -> None:
+    with (
+        DaqmxServer(rig, allow_commands=True) as server,
+        grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel,
+        nidaqmx.Task(grpc_options=GrpcSessionOptions(channel, "")) as port,
+    ):
+        port.do_channels.add_do_chan("rig/port0", line_grouping=LineGrouping.CHAN_FOR_ALL_LINES)
+        port.timing.cfg_samp_clk_timing(2000.0, samps_per_chan=1000)
+        port.write([1, 0])
+        port.start()
+        generator = next(thread for thread in threading.enumerate() if "_generate" in thread.name)
+        port.stop()
+        generator.join(10.0)
+        assert not generator.is_alive()
+
+
 def test_clocked_lines_of_outputs_wait_for_the_clock(rig: PlayedRig, task: nidaqmx.Task) -> None:
     task.di_channels.add_di_chan("rig/port0", line_grouping=LineGrouping.CHAN_FOR_ALL_LINES)
     task.timing.cfg_samp_clk_timing(20_000.0, samps_per_chan=ROWS)
@@ -312,6 +365,48 @@ def test_outputs_are_refused_unless_commands_are_allowed(rig: PlayedRig, task: n
         with refused(DAQmxErrors.RESOURCE_ALREADY_RESERVED):
             create("rig/port0/line0")
     assert not rig.commands
+
+
+class Secret(grpc.UnaryUnaryClientInterceptor, grpc.UnaryStreamClientInterceptor):
+    """Sends a secret with each call."""
+
+    def __init__(self, secret: str) -> None:
+        self._secret = secret
+
+    def intercept_unary_unary(self, call: Any, details: Any, request: Any) -> Any:
+        return call(details._replace(metadata=[("rig-secret", self._secret)]), request)
+
+    intercept_unary_stream = intercept_unary_unary
+
+
+def test_outputs_need_the_secret_and_inputs_do_not(rig: PlayedRig) -> None:
+    with (
+        DaqmxServer(rig, allow_commands=True, secret="a1") as server,
+        grpc.insecure_channel(f"127.0.0.1:{server.port}") as plain,
+    ):
+        own, other, none = (
+            GrpcSessionOptions(grpc.intercept_channel(plain, *interceptors), "")
+            for interceptors in ([Secret("a1")], [Secret("a2")], [])
+        )
+        with nidaqmx.Task("t", grpc_options=none) as task, refused(DAQmxErrors.PASSWORD_REQUIRED):
+            task.do_channels.add_do_chan("rig/port0/line0")
+        with nidaqmx.Task("t", grpc_options=other) as task, refused(DAQmxErrors.INCORRECT_PASSWORD):
+            task.ao_channels.add_ao_voltage_chan("rig/ao0")
+        with nidaqmx.Task("t", grpc_options=none) as task:
+            task.ai_channels.add_ai_voltage_chan("rig/ai0")
+            task.start()
+        with refused(DAQmxErrors.PASSWORD_REQUIRED):
+            System.remote(none).devices["rig"].reset_device()
+        with nidaqmx.Task("t", grpc_options=own) as task:
+            task.do_channels.add_do_chan("rig/port0/line0")
+            stub, session = NiDAQmxStub(plain), type(nidaqmx_pb2.StartTaskRequest().task)(name="t")
+            for name in ("StartTask", "ClearTask", "WriteDigitalScalarU32"):  # tasks belong to no program
+                with pytest.raises(grpc.RpcError) as error:
+                    getattr(stub, name)(getattr(nidaqmx_pb2, f"{name}Request")(task=session))
+                assert error.value.code() is grpc.StatusCode.PERMISSION_DENIED
+            assert not rig.commands
+            task.write(True)
+    assert [name for name, _ in rig.commands] == ["hammer"]
 
 
 def test_outputs_send_commands_at_rising_edges(rig: PlayedRig) -> None:

@@ -70,11 +70,13 @@ def rig() -> Iterator[Rig]:
 
 
 @contextlib.contextmanager
-def serving(server: MemoryServer, send: Any, *, commands: bool = True) -> Iterator[FoxgloveClient]:
+def serving(
+    server: MemoryServer, send: Any, *, commands: bool = True, secret: str | None = None
+) -> Iterator[FoxgloveClient]:
     """Serve a rig, and yield a client of the WebSocket server."""
     done = threading.Event()
-    settings = {"view_rate_hz": 500.0, "send": send, "allow_commands": commands, "allow_playback": True}
-    with FoxgloveServer(MemoryClient(server), ("127.0.0.1", 0), **settings) as served:
+    access = {"allow_commands": commands, "allow_playback": True, "secret": secret}
+    with FoxgloveServer(MemoryClient(server), ("127.0.0.1", 0), view_rate_hz=500.0, send=send, **access) as served:
         cycle = threading.Thread(target=served.run, args=(done.is_set,))
         cycle.start()
         try:
@@ -141,6 +143,17 @@ def test_services_are_refused_without_permission(rig: Rig) -> None:
         for name in SERVICES:
             assert "--allow-commands" in client.call(name, {})["message"]
     assert rig.sent == []
+
+
+def test_services_need_the_secret(rig: Rig) -> None:
+    with serving(rig.server, rig.send, secret="a1") as client:
+        for name in SERVICES:
+            for wrong in ({}, {"secret": "a2"}, {"secret": ["a1"]}, {"secret": "\u20ac"}):
+                assert "secret must be" in client.call(name, wrong)["message"]
+        assert rig.sent == []
+        assert client.call("speed", {"speed_hz": 5.0, "secret": "a1"})["command"] == "speed"
+        assert "secret" in client.services["speed"]["request"]["schema"]
+    assert rig.sent == [("speed", {"speed_hz": 5.0})]
 
 
 def test_parameters_are_the_scene_and_cannot_be_set(rig: Rig) -> None:

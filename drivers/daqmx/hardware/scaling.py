@@ -11,6 +11,8 @@ from rig.channels.table import Channel
 
 _GRAVITY, _POUND, _INCH, _MIL = 9.80665, 4.4482216152605, 25.4e-3, 25.4e-6
 """Standard gravity [m/s^2], pound-force [N], inch and mil [m]."""
+_MAX_FACTOR = 1e15
+"""Largest factor of a scale, and inverse of the smallest one: products of three are finite and not zero."""
 _Accel, _Force, _Probe = (
     c.AccelSensitivityUnits,
     c.ForceIEPESensorSensitivityUnits,
@@ -56,7 +58,7 @@ def get_scale(request: Any, channel: Channel) -> tuple[float, float]:
         channel: Row of the channel table.
 
     Raises:
-        DaqmxError: A unit is not supported, or the sensitivity or excitation is zero.
+        DaqmxError: A unit is not supported, or a sensitivity, excitation or difference is zero or not finite.
     """
     unit = _get_size(_UNITS, request, "units")
     if hasattr(request, "sensitivity"):
@@ -72,7 +74,8 @@ def get_scale(request: Any, channel: Channel) -> tuple[float, float]:
         return gain / unit, 0.0
     electrical, physical = _get_size(_UNITS, request, "electrical_units"), _get_size(_UNITS, request, "physical_units")
     span = _check(request.second_electrical_val - request.first_electrical_val, "difference of the electrical values")
-    slope = (request.second_physical_val - request.first_physical_val) / span
+    height = _check(request.second_physical_val - request.first_physical_val, "difference of the physical values")
+    slope = height / span
     offset = request.first_physical_val - request.first_electrical_val * slope
     return gain / electrical * slope * physical / unit, offset * physical / unit
 
@@ -85,6 +88,6 @@ def _get_size(sizes: dict[Any, float], request: Any, field: str) -> float:
 
 
 def _check(value: float, what: str) -> float:
-    if value == 0.0:
-        refuse_value(what, "non-zero", value)
+    if not 1.0 / _MAX_FACTOR <= abs(value) <= _MAX_FACTOR:
+        refuse_value(what, f"from {1.0 / _MAX_FACTOR:g} to {_MAX_FACTOR:g} in size", value)
     return value

@@ -21,6 +21,8 @@ _KINDS = {
     "Counter": ChannelType.COUNTER_INPUT, "Ctr": ChannelType.COUNTER_INPUT,
 }  # fmt: skip
 
+_MAX_ON_DEMAND = 10_000
+"""Largest number of samples of a write without a sample clock, which sets them one after another."""
 _PIECE = 1 << 16
 """Values that are Python objects at a time: they need four times the memory."""
 
@@ -106,6 +108,8 @@ class DaqmxServicer(Properties):
             count, columns = len(samples), dict(zip(samples.names, samples.values.T, strict=True))
             if kind != "ScalarU32":
                 response.status = status
+            elif status:
+                raise DaqmxError(Code(status), "no sample came in time")
         states = np.zeros((count, len(lines), max(map(len, lines))), dtype=np.uint8)
         for number, group in enumerate(lines):
             for place, line in enumerate(group):
@@ -137,34 +141,36 @@ class DaqmxServicer(Properties):
         lines = [channel.physical for channel in task.channels]
         bytewise = kind in ("Lines", "Waveforms")
         if kind == "Waveforms":
-            columns = [
+            signals = [
                 np.frombuffer(each.y_data, np.uint8).reshape(-1, max(1, each.signal_count))[:, ::-1]  # line 0 is last
                 for each in request.waveforms
             ]
-            if [each.shape[1] for each in columns] != list(map(len, lines)) or len(set(map(len, columns))) != 1:
+            if [each.shape[1] for each in signals] != list(map(len, lines)) or len(set(map(len, signals))) != 1:
                 raise DaqmxError(Code.NUM_LINES_MISMATCH_IN_READ_OR_WRITE, "a signal for each line of each channel")
-            samples: Any = list(zip(*columns, strict=True))
         elif kind == "Lines":
             data = np.frombuffer(request.write_array, dtype=np.uint8)
-            samples = _unfill(data, request, (len(lines), max(map(len, lines))))
+            signals = list(_unfill(data, request, (len(lines), max(map(len, lines)))).swapaxes(0, 1))
         else:
             data = np.array([request.value] if kind == "ScalarU32" else request.write_array, dtype=np.int64)
-            samples = _unfill(data, request, (len(lines),))
-        pattern = []
-        for sample in samples:
-            states = {}
-            for group, value in zip(lines, sample, strict=True):
-                for place, line in enumerate(group):
-                    bit = value[place] if bytewise else value >> _get_line(line) & 1
-                    states[self._device.lines[line]] = bool(bit)
-            pattern.append(states)
-        if task.clocked and pattern:
-            task.output = lambda numbers: self._generate([pattern[number % len(pattern)] for number in numbers])
+            signals = list(_unfill(data, request, (len(lines),)).T)
+        states = np.stack([
+            values[:, place] if bytewise else values >> _get_line(line) & 1
+            for group, values in zip(lines, signals, strict=True) for place, line in enumerate(group)
+        ], axis=1).astype(bool)  # fmt: skip
+        names = [self._device.lines[line] for group in lines for line in group]
+
+        def get_states(number: int) -> dict[str, bool]:
+            return dict(zip(names, states[number % len(states)].tolist(), strict=True))
+
+        if task.clocked and len(states):
+            task.output = lambda numbers: self._generate([get_states(number) for number in numbers])
+        elif not task.clocked:
+            _check_on_demand(states)
         self._start(task, request)
-        for states in [] if task.clocked else pattern:
-            self._outputs.set_lines(states)
+        for number in range(0 if task.clocked else len(states)):
+            self._outputs.set_lines(get_states(number))
         if kind != "ScalarU32":
-            response.samps_per_chan_written = len(samples)
+            response.samps_per_chan_written = len(states)
 
     def _generate(self, samples: list[dict[str, bool]]) -> None:
         """Set lines at the clock; like a signal without feedback, an edge that the rig refuses has no effect."""
@@ -176,6 +182,7 @@ class DaqmxServicer(Properties):
         """Set the set point of the drive."""
         task = self.task(request)
         _check_write(task, ChannelType.ANALOG_OUTPUT)
+        _check_on_demand(request.write_array if not scalar else ())
         self._start(task, request)
         limits = task.channels[0].attributes
         values = [request.value] if scalar else list(request.write_array)
@@ -234,6 +241,11 @@ def _check_kind(task: Task, *kinds: ChannelType) -> None:
 def _check_write(task: Task, kind: ChannelType) -> None:
     if task.kind is not kind:
         raise DaqmxError(Code.WRITE_CHAN_TYPE_MISMATCH, "the channels of the task are of another kind")
+
+
+def _check_on_demand(samples: Any) -> None:
+    if len(samples) > _MAX_ON_DEMAND:
+        refuse_value("num_samps_per_chan", f"at most {_MAX_ON_DEMAND} without a sample clock", len(samples))
 
 
 def _fill(values: np.ndarray, request: Any) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import secrets
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -24,6 +25,11 @@ from drivers.sources import Source
 from rig.base.errors import InputError
 
 _MAX_TASKS = 64
+SECRET_KEY = "rig-secret"
+"""Key of the secret in the metadata of a call."""
+_OUTPUTS = (ChannelType.DIGITAL_OUTPUT, ChannelType.ANALOG_OUTPUT)
+_OUTPUT_CALLS = ("CreateDO", "CreateAO", "Write", "ResetDevice")
+"""Beginnings of the calls that need the secret for every task."""
 _INITIALIZE, _ATTACH = 1, 2
 """Behaviours for a session: a new one only, an existing one only."""
 
@@ -35,9 +41,13 @@ class Sessions(Calls):
         device: The device.
         outputs: Its outputs.
         open_source: Opens a source of counts.
+        secret: Required in the metadata of calls for outputs; None: they need none.
     """
 
-    def __init__(self, device: Device, outputs: Outputs, open_source: Callable[[], Source]) -> None:
+    def __init__(
+        self, device: Device, outputs: Outputs, open_source: Callable[[], Source], secret: str | None = None
+    ) -> None:
+        self._secret = secret
         self._device, self._outputs, self._open_source = device, outputs, open_source
         self._tasks: dict[str, Task] = {}
         self._lock = threading.Lock()
@@ -48,6 +58,20 @@ class Sessions(Calls):
         """Stop all tasks."""
         for task in list(self._tasks.values()):
             task.stop()
+
+    def check(self, call: str, request: Any, context: Any) -> None:
+        """Check the texts of a request, and its secret if it is for outputs, whose tasks all programs can name."""
+        super().check(call, request, context)
+        task = self._tasks.get(request.task.name) if hasattr(request, "task") else None
+        is_output = task is not None and any(channel.kind in _OUTPUTS for channel in task.channels)
+        if self._secret is None or not (is_output or call.startswith(_OUTPUT_CALLS)):
+            return
+        given = str(dict(context.invocation_metadata()).get(SECRET_KEY, ""))
+        if not secrets.compare_digest(given.encode(), self._secret.encode()):
+            code = Code.INCORRECT_PASSWORD if given else Code.PASSWORD_REQUIRED
+            raise DaqmxError(
+                code, f"outputs need the secret of `rig daqmx --secret FILE` as {SECRET_KEY} in the metadata"
+            )
 
     def task(self, request: Any) -> Task:
         """Return the task of a request.
@@ -224,7 +248,8 @@ class Sessions(Calls):
             self._outputs.check()
             kind, known = ChannelType.DIGITAL_OUTPUT, self._device.lines
         lines, name = self._device.expand_lines(request.lines, known), request.name_to_assign_to_lines
-        groups = [(name or request.lines, lines)]
+        names = unflatten_channel_string(request.lines)
+        groups = [(name or (f"{names[0]}..." if len(names) > 1 else request.lines), lines)]  # the driver's name
         if request.line_grouping_raw == constants.LineGrouping.CHAN_PER_LINE.value:
             groups = [(each, [line]) for each, line in _name_channels(name, lines)]
         numbers = [{f"D{which}_NUM_LINES": len(group)} for _, group in groups]

@@ -17,13 +17,15 @@ from nidaqmx.constants import (
 from drivers.daqmx.hardware.device import Device
 from drivers.daqmx.hardware.errors import Code, DaqmxError
 from drivers.daqmx.tasks.acquisition import Acquisition, Plan
-from drivers.daqmx.tasks.configuration import MAX_BUFFER, Configuration
+from drivers.daqmx.tasks.configuration import Configuration
 from drivers.daqmx.tasks.counters import Counter
 from drivers.link import LinkTimeoutError
 from drivers.sources import Source
 from drivers.sources.samples import ALL_AVAILABLE, Samples, StreamEndedError, merge_samples
 from rig.serve.waiting import Deadline
 
+_MAX_READ = 1 << 23
+"""Largest number of values of all channels that a read may want: 67 MB in a reply, and as much for each copy."""
 POLL_S = 0.2
 """Period at which a waiting call checks whether its program still waits [s]."""
 
@@ -121,7 +123,7 @@ class Task(Configuration):
     def _generate(self, acquisition: Acquisition) -> None:
         """Write the output samples at the sample clock: those of a block when the block arrives."""
         number = 0
-        while not (acquisition.done and not acquisition.available):
+        while self.acquisition is acquisition and not (acquisition.done and not acquisition.available):
             with contextlib.suppress(LinkTimeoutError, StreamEndedError):
                 arrived = len(acquisition.read(ALL_AVAILABLE, timeout_s=POLL_S, whole=False))
                 if self.acquisition is acquisition and self.output is not None:
@@ -153,7 +155,7 @@ class Task(Configuration):
         """
         if self.kind not in (ChannelType.ANALOG_INPUT, ChannelType.COUNTER_INPUT, ChannelType.DIGITAL_INPUT):
             raise DaqmxError(Code.READ_NO_INPUT_CHANS_IN_TASK, "the task has outputs only")
-        if count * len(self.channels) > MAX_BUFFER:
+        if count * len(self.channels) > _MAX_READ:
             raise DaqmxError(Code.PAL_MEMORY_FULL, f"{count} samples of {len(self.channels)} channels in one read")
         automatic = not self.started
         if automatic:

@@ -8,7 +8,7 @@ import typer
 
 from rig.base.errors import InputError, require_package
 from rig.base.text import printable
-from rig.cli.connections.connection import Connection
+from rig.cli.connections.connection import Connection, SecretFile
 from rig.cli.output.tables import echo
 from rig.cli.signals import stop_on_signals
 
@@ -27,6 +27,7 @@ def daqmx(
     allow_commands: Annotated[
         bool, typer.Option("--allow-commands", help="Let digital and analog outputs command the rig")
     ] = False,
+    secret: SecretFile = None,
     connection: Connection,
 ) -> None:
     """Serve a running rig to programs that use nidaqmx, over gRPC, until Ctrl-C."""
@@ -42,10 +43,11 @@ def daqmx(
         require_package(package, "nidaqmx")
     from drivers.daqmx.server import DaqmxServer
 
+    required = connection.read_secret(secret, allow_commands=allow_commands)
     done = threading.Event()
     with (
         connection.client() as client,
-        DaqmxServer(client, port=port, device=device, allow_commands=allow_commands) as server,
+        DaqmxServer(client, port=port, device=device, allow_commands=allow_commands, secret=required) as server,
     ):
         for physical, channel in server.device.channels.items():
             row = server.device.table.channels[channel]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ import typer
 
 from rig.base.errors import InputError, require_package
 from rig.base.files import check_new_file, write_file
-from rig.cli.connections.connection import Connection
+from rig.cli.connections.connection import Connection, SecretFile
 from rig.cli.options import Force
 from rig.cli.output.tables import echo
 from rig.cli.signals import stop_on_signals
@@ -35,13 +35,14 @@ def foxglove(
     allow_commands: Annotated[
         bool, typer.Option("--allow-commands", help="Accept commands, and the play bar of a replay that runs")
     ] = False,
+    secret: SecretFile = None,
     view_rate_hz: Annotated[float, typer.Option(help="Rate of the messages for plots in Hz")] = 500.0,
     connection: Connection,
     force: Force = False,
 ) -> None:
     """Serve a running rig, or a recording, to the Foxglove app, until Ctrl-C.
 
-    Other programs with Foxglove's WebSocket protocol can connect too. There is no password.
+    Other programs with Foxglove's WebSocket protocol can connect too; only commands can need a secret.
     """
     from recorder.writer import check_view_rate
     from rig.serve.transport.endpoint import check_free, parse_loopback
@@ -55,11 +56,14 @@ def foxglove(
     check_view_rate(view_rate_hz)
     if view_rate_hz == 0.0:
         raise InputError("--view-rate-hz", "above 0", view_rate_hz)
-    if replay is None:
-        _serve(connection, address, view_rate_hz, commands=allow_commands, playback=allow_commands)
-    else:
-        with _replayed(replay) as endpoint:
-            _serve(replace(connection, connect=endpoint), address, view_rate_hz, commands=allow_commands, playback=True)
+    source = connection if replay is None else replace(connection, tls=None)
+    required = source.read_secret(secret, allow_commands=allow_commands)
+    playback = replay is not None or (allow_commands and required is None)
+    with nullcontext(source.connect) if replay is None else _replayed(replay) as endpoint:
+        _serve(
+            replace(source, connect=endpoint), address, view_rate_hz,
+            allow_commands=allow_commands, allow_playback=playback, secret=required,
+        )  # fmt: skip
 
 
 def _write_layout(path: Path, recording: Path | None, *, force: bool) -> None:
@@ -73,7 +77,7 @@ def _write_layout(path: Path, recording: Path | None, *, force: bool) -> None:
 
 
 def _serve(
-    connection: Connection, address: tuple[str, int], view_rate_hz: float, *, commands: bool, playback: bool
+    connection: Connection, address: tuple[str, int], view_rate_hz: float, *, secret: str | None, **access: bool
 ) -> None:
     """Serve the rig at an address until a signal."""
     from drivers.console import Console
@@ -82,13 +86,14 @@ def _serve(
     done = threading.Event()
     with connection.client() as client:
         console = Console(client, name=f"rig foxglove pid {os.getpid()}", any_rig=True)
-        access = {"allow_commands": commands, "allow_playback": playback}
         with (
-            FoxgloveServer(client, address, view_rate_hz=view_rate_hz, send=console.send, **access) as server,
+            FoxgloveServer(
+                client, address, view_rate_hz=view_rate_hz, send=console.send, secret=secret, **access
+            ) as server,
             stop_on_signals(done.set),
         ):
             echo(f"ws://127.0.0.1:{server.port} serves the rig at {connection.connect}; {server.app_url}")
-            if commands:
+            if access["allow_commands"] and secret is None:
                 echo("rig: warning: every program and every page in a browser here can send commands", err=True)
             echo("rig: Ctrl-C ends it", err=True)
             server.run(done.is_set)

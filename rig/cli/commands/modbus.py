@@ -71,6 +71,8 @@ def _serve(listen: str, settings: dict[str, float], connection: Connection, *, a
         serve(registers, address, gateway.command if allow_commands else None) as publish,
     ):
         access = "reads and commands" if allow_commands else "reads only"
+        if allow_commands and connection.tls is not None:
+            echo("rig: warning: every program here can trip and stop the rig: Modbus carries no secret", err=True)
         echo(f"rig: Modbus TCP at {listen}, {access}; Ctrl-C ends it", err=True)
         while not stopped.is_set():
             try:

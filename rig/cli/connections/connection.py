@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from rig.serve.transport.zenoh import Exposure, ZenohClient, ZenohServer
 
 _exposure = panel("For other computers")
+SecretFile = Annotated[
+    Path | None, typer.Option("--secret", metavar="FILE", help="Commands need the secret of this file, made if absent")
+]
 _TLS = "RIG_TLS"
 _LINK_S = 1.0
 """Time limit for the connection to a rig that is running [s]."""
@@ -73,6 +76,25 @@ class Connection:
             if not from_environment or error.field != "--tls":
                 raise
             raise InputError(_TLS, error.must, error.received) from None
+
+    def read_secret(self, path: Path | None, *, allow_commands: bool) -> str | None:
+        """Return the secret that a server of this rig requires for commands; None: it requires none.
+
+        Args:
+            path: The file of the secret.
+            allow_commands: Whether the server accepts commands.
+
+        Raises:
+            InputError: The file is wrong, is given without commands, or is missing where the rig needs certificates.
+        """
+        from rig.serve.transport.exposure.secret import read_secret
+
+        if path is None and allow_commands and self.tls is not None:
+            must = "given with --secret FILE for a rig with certificates (--tls)"
+            raise InputError("--allow-commands", must, Words("no --secret"))
+        if path is not None and not allow_commands:
+            raise InputError("--secret", "given with --allow-commands", Words("no --allow-commands"))
+        return None if path is None else read_secret(path)
 
     def _show_waiting(self) -> Any:
         return table_console(stderr=True).status(plain_text(f"waiting for a rig at {self.connect}"))
