@@ -18,7 +18,7 @@ from rig.base.files import Closing
 from rig.serve.transport import Client
 
 _MAX_CALLS = 64
-"""Number of calls and events at a time; further ones wait."""
+"""Number of calls and events at a time; further ones are refused."""
 
 
 class DaqmxServer(Closing):
@@ -55,7 +55,11 @@ class DaqmxServer(Closing):
 
         self._servicer = DaqmxServicer(self.device, outputs, open_source, secret)  # pyrefly: ignore[bad-instantiation]
         self._pool = ThreadPoolExecutor(_MAX_CALLS, thread_name_prefix="daqmx")
-        self._server = grpc.server(self._pool, options=[("grpc.so_reuseport", 0), ("grpc.max_send_message_length", -1)])
+        self._server = grpc.server(
+            self._pool,
+            options=[("grpc.so_reuseport", 0), ("grpc.max_send_message_length", -1)],
+            maximum_concurrent_rpcs=_MAX_CALLS,
+        )
         add_NiDAQmxServicer_to_server(self._servicer, self._server)
         self.port: int = self._server.add_insecure_port(f"127.0.0.1:{port}")
         """Port on 127.0.0.1."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
 from collections.abc import Callable, Iterator
@@ -29,6 +30,7 @@ from nitypes.waveform import DigitalWaveform
 from drivers.daqmx.rpc.calls import CHECKED_VERSION
 from drivers.daqmx.server import DaqmxServer
 from drivers.daqmx.tasks.settings import DEFAULTS
+from drivers.daqmx.tasks.task import Task
 from rig.base import wire
 from rig.channels.table import default_table
 from rig.serve.waiting import wait_until
@@ -321,6 +323,8 @@ def test_large_messages_are_refused_before_they_need_memory(rig: PlayedRig) -> N
         for name in ("1" * 2000, ",".join(["rig/ai0:14998"] * 20)):
             with pytest.raises(nidaqmx.DaqError, match="at most 1024 characters with 16 colons"):
                 task.ai_channels.add_ai_voltage_chan(name)
+        with pytest.raises(nidaqmx.DaqError, match=r"rig/ai0\\x1b\[2J; this device"):
+            task.ai_channels.add_ai_voltage_chan("rig/ai0\x1b[2J")
         with refused(DAQmxErrors.INVALID_ATTRIBUTE_VALUE):
             task.ai_channels.add_ai_accel_chan("rig/ai10", sensitivity=5e-324)
         task.ai_channels.add_ai_voltage_chan("rig/ai0:14")
@@ -348,6 +352,47 @@ def test_a_clocked_output_that_is_stopped_early_leaves_no_thread(rig: PlayedRig)
         port.stop()
         generator.join(10.0)
         assert not generator.is_alive()
+
+
+def test_calls_beyond_the_limit_are_refused_and_do_not_wait(task: nidaqmx.Task, options: GrpcSessionOptions) -> None:
+    stub, session = NiDAQmxStub(options.grpc_channel), type(nidaqmx_pb2.StartTaskRequest().task)(name=task.name)
+    events = [stub.RegisterDoneEvent(nidaqmx_pb2.RegisterDoneEventRequest(task=session)) for _ in range(64)]
+    for event in events:
+        event.initial_metadata()
+    with pytest.raises(nidaqmx.errors.RpcError, match="Concurrent RPC limit exceeded"):
+        task.name  # noqa: B018
+    for event in events:
+        event.cancel()
+
+    def is_served() -> bool:
+        with contextlib.suppress(nidaqmx.errors.RpcError):
+            return bool(task.name)
+        return False
+
+    assert wait_until(is_served, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("clear", "text"), [(False, "Operation aborted: the task was stopped"), (True, "Invalid task: 't' was cleared")]
+)
+def test_calls_of_another_program_during_a_read_end_it(
+    options: GrpcSessionOptions, monkeypatch: pytest.MonkeyPatch, clear: bool, text: str
+) -> None:
+    start = Task.start
+
+    def race(task: Task) -> None:
+        if not clear:
+            start(task)
+        task.stop(clear=clear)
+        if clear:
+            start(task)
+
+    monkeypatch.setattr(Task, "start", race)
+    with nidaqmx.Task("t", grpc_options=options) as task:
+        task.ai_channels.add_ai_voltage_chan("rig/ai0")
+        with pytest.raises(nidaqmx.DaqError, match=text):
+            task.read()
+    assert not [thread for thread in threading.enumerate() if thread.name == "daq reports"]
 
 
 def test_clocked_lines_of_outputs_wait_for_the_clock(rig: PlayedRig, task: nidaqmx.Task) -> None:

@@ -54,10 +54,10 @@ class Sessions(Calls):
         self._numbers = itertools.count()
         self.bind()
 
-    def close(self) -> None:
-        """Stop all tasks."""
+    def close(self, *, clear: bool = True) -> None:
+        """Stop all tasks; they cannot be started again."""
         for task in list(self._tasks.values()):
-            task.stop()
+            task.stop(clear=clear)
 
     def check(self, call: str, request: Any, context: Any) -> None:
         """Check the texts of a request, and its secret if it is for outputs, whose tasks all programs can name."""
@@ -102,10 +102,10 @@ class Sessions(Calls):
     @call("ClearTask|StopTask")
     def stop_task(self, request: Any, _: Any, response: Any) -> None:
         """Stop a task, and remove it if it is cleared."""
-        task = self.task(request)
-        if type(response).__name__.startswith("Clear"):
+        task, clear = self.task(request), type(response).__name__.startswith("Clear")
+        if clear:
             self._tasks.pop(task.name, None)
-        task.stop()
+        task.stop(clear=clear)
 
     @call("StartTask")
     def start_task(self, request: Any, *_: Any) -> None:
@@ -143,7 +143,7 @@ class Sessions(Calls):
         """Stop all tasks; a self-test has no effect."""
         self._device.check_name(request.device_name)
         if action == "Reset":
-            self.close()
+            self.close(clear=False)
 
     # ---- timing and triggers ----
 

@@ -47,6 +47,7 @@ class Task(Configuration):
         self.acquisition: Acquisition | None = None
         self.output: Callable[[range], None] | None = None
         """Writes the output samples of a range to the lines, for a task with a sample clock."""
+        self._cleared = False
         self._generator = threading.Thread()
         self._plan = Plan(0)
         self._open_source = open_source
@@ -55,10 +56,12 @@ class Task(Configuration):
         """Start.
 
         Raises:
-            DaqmxError: The task runs, or its settings do not match the device.
+            DaqmxError: The task runs or was cleared, or its settings do not match the device.
         """
         with self.changed:
             self._check_stopped()
+            if self._cleared:
+                raise DaqmxError(Code.INVALID_TASK, f"{self.name!r} was cleared")
             names, rate_hz, plan = self.plan()
             if names:
                 generates = self.kind is ChannelType.DIGITAL_OUTPUT
@@ -76,9 +79,10 @@ class Task(Configuration):
             self._plan, self.position, self.started = plan, 0, True
             self.changed.notify_all()
 
-    def stop(self) -> None:
-        """Stop; unread samples are discarded."""
+    def stop(self, *, clear: bool = False) -> None:
+        """Stop; unread samples are discarded. A cleared task cannot be started again, by a call in progress."""
         with self.changed:
+            self._cleared |= clear
             acquisition, self.acquisition, self.started, self.position = self.acquisition, None, False, 0
             self.changed.notify_all()
         if acquisition is not None:
@@ -163,7 +167,8 @@ class Task(Configuration):
                 raise DaqmxError(Code.CANNOT_READ_WHEN_AUTO_START_FALSE_AND_TASK_NOT_RUNNING_OR_COMMITTED, "start it")
             self.start()
         acquisition, plan = self.acquisition, self._plan
-        assert acquisition is not None
+        if acquisition is None:
+            raise DaqmxError(Code.OPERATION_ABORTED, "the task was stopped")
         try:
             samples, status = self._wait_for_samples(acquisition, plan, count, timeout_s, active)
             while plan.newest_only and not status and len(samples) < count:
