@@ -548,9 +548,9 @@ def connect(
     """Connect to a running rig.
 
     Args:
-        url: `zenoh:HOST:PORT`, with `?tls=DIR` for a rig served with TLS; the name of a rig on this computer; or
-            `can:INTERFACE:CHANNEL[?NAME=VALUE&...]`, with `node=N` for the node number of a device under test. Over CAN
-            the commands, events and channels are those of the bus, and the client's name is `CAN N`.
+        url: `HOST:PORT` or `zenoh:HOST:PORT`, with `?tls=DIR` for a rig served with TLS; the name of a rig on this
+            computer; or `can:INTERFACE:CHANNEL[?NAME=VALUE&...]`, with `node=N` for the node number of a device under
+            test. Over CAN the commands, events and channels are those of the bus, and the client's name is `CAN N`.
         channels: Channels to read, from now on.
         wait_s: Longest wait for a rig to reply [s].
         settings: Further arguments of `Rig`: `rate_hz` [Hz], `buffer_s` [s], `truth`, `name`.

@@ -6,9 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from drivers.sources.samples import Samples
-from rig.base.errors import InputError
-
-FORMS = "zenoh:HOST:PORT[?tls=DIR], the name of a rig, can:INTERFACE:CHANNEL[?NAME=VALUE&...]"
 
 
 class Source(Protocol):
@@ -61,23 +58,21 @@ def open_source(url: str, *, wait_s: float = 3.0) -> Source:
     """Open the source at a URL.
 
     Args:
-        url: `zenoh:127.0.0.1:7460`; `zenoh:lab.example:7463?tls=keys/viewer` for a rig served with TLS; the name of a
-            rig on this computer; or `can:zenoh:can0`, with settings of python-can's bus as `?NAME=VALUE&...`.
+        url: `127.0.0.1:7460` or `zenoh:127.0.0.1:7460`; `zenoh:lab.example:7463?tls=keys/viewer` for a rig served with
+            TLS; the name of a rig on this computer; or `can:zenoh:can0`, with settings of python-can's bus as
+            `?NAME=VALUE&...`.
         wait_s: Longest wait for a rig to reply [s].
 
     Raises:
         InputError: The URL is malformed.
         ConnectionError: No rig replies.
     """
-    kind, colon, rest = url.partition(":")
-    if (kind == "zenoh" and rest) or (url and not colon):
-        from drivers.sources.rig import RigSource
-        from rig.serve.transport.zenoh import connect_url
-
-        client = connect_url(url, wait_s=wait_s)
-        return RigSource(client, close=client.close)
-    if kind == "can" and rest:
+    if url.startswith("can:"):
         from drivers.sources.can import CanSource
 
-        return CanSource(rest, wait_s=wait_s)
-    raise InputError("url", f"one of {FORMS}", url)
+        return CanSource(url.removeprefix("can:"), wait_s=wait_s)
+    from drivers.sources.rig import RigSource
+    from rig.serve.transport.zenoh import connect_url
+
+    client = connect_url(url, wait_s=wait_s)
+    return RigSource(client, close=client.close)

@@ -97,7 +97,7 @@ def test_the_examples_give_the_first_table_of_the_page(tmp_path: Path) -> None:
             found = re.search(r'"/?(\w+)/(ai|ctr|port)\d', example.read_text(encoding="utf-8-sig"))
             assert found is not None
             if (name := found[1]) not in ports:
-                arguments = ("--port", "0", "--device", name, "--allow-commands")
+                arguments = ("--listen", "127.0.0.1:0", "--device", name, "--allow-commands")
                 server = stack.enter_context(processes.start_rig("daqmx", "--connect", endpoint, *arguments))
                 ports[name] = int(processes.read_line(server, "NI-DAQmx device").rpartition(":")[2].partition(";")[0])
             rows[example.relative_to(root).as_posix()] = run(example, ports[name], tmp_path)

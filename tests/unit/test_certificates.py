@@ -279,9 +279,8 @@ def test_commands_with_a_certificate_need_a_secret(
     command: str, options: tuple[str, ...], must: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip({"daqmx": "nidaqmx"}.get(command, command))
-    address = ("--port", "0") if command == "daqmx" else ("--listen", "127.0.0.1:0")
     with pytest.raises(SystemExit) as end, contextlib.chdir(tmp_path):
-        main([command, *address, *options])
+        main([command, "--listen", "127.0.0.1:0", *options])
     error = capsys.readouterr().err
     assert (end.value.code, error.count("\n"), must in error) == (2, 1, True), error
     assert not list(tmp_path.iterdir())

@@ -18,11 +18,10 @@ import numpy as np
 import pytest
 
 import rig
-from drivers.protection.modbus.registers import FLOATS, Contents, RegisterMap
+from drivers.protection.modbus.registers import Contents, RegisterMap
 from drivers.protection.modbus.server import Server, serve
 from drivers.sources.samples import Samples
 from rig.base.errors import RefusedError
-from rig.channels.orbit import find_edges, synchronous
 from rig.channels.table import default_table
 from tests.processes import ROOT, free_port
 from tests.unit.modbus_client import ModbusClient, ModbusError
@@ -50,50 +49,6 @@ def session() -> Samples:
 def served(command: object = None) -> Iterator[tuple[int, object]]:
     with serve(REGISTERS, ("127.0.0.1", port := free_port()), command) as publish:
         yield port, publish
-
-
-def test_registers_equal_the_detectors_of_a_recording(session: Samples) -> None:
-    contents, rate = Contents(REGISTERS, SETTINGS), session.rate_hz
-    contents.feed(session)
-    end = len(session) - len(session) % round(0.1 * rate)
-    rows, recent = session.rows(0, end), session.rows(end - round(0.25 * rate), end)
-    edges_s = find_edges(rows["keyphasor"], rows.times_s)[-2:]
-    first, last = np.searchsorted(rows.times_s, edges_s)
-    with served() as (port, publish), ModbusClient(port) as client:
-        publish(contents.values, contents.bits)
-        assert client.registers(0, 58) == client.registers(0, 58, code=3)
-        words, floats = client.registers(0, 58), client.registers(FLOATS, 116)
-        bits = client.bits(0, len(REGISTERS.bits))
-    found, exact = {}, {}
-    for row, word in zip(REGISTERS.registers, words, strict=True):
-        count = word - 0x10000 if (row.lowest or 0) < 0 and word >= 0x8000 else word
-        assert row.lsb is not None
-        assert row.float_address is not None
-        key = row.channel, row.value.removeprefix("1X ").split(" ")[0].strip(",")
-        found[key] = count * row.lsb, row.lsb
-        at = row.float_address - FLOATS
-        (exact[key],) = struct.unpack(">f", struct.pack(">2H", *floats[at : at + 2]))
-    assert found["", "speed"][0] == pytest.approx(60.0 / np.diff(edges_s)[0], abs=0.1)
-    assert found["", "simulated"][0] == pytest.approx(end / rate, abs=1e-6)
-    for channel in REGISTERS.channels:
-        signal = rows[channel.name]
-        vector = synchronous(signal, rows.times_s, edges_s)[1][0]
-        expected = {
-            "overall": np.ptp(recent[channel.name]),
-            "gap": channel.bias_v + channel.sensitivity_v * signal[first:last].mean(),
-            "amplitude": abs(vector),
-        }
-        for value, number in expected.items():
-            shown, lsb = found[channel.name, value]
-            assert abs(shown - number) <= lsb, (channel.name, value)
-            assert exact[channel.name, value] == pytest.approx(number, rel=1e-6, abs=1e-12)
-        lag = found[channel.name, "phase"][0]
-        assert abs((lag + np.degrees(np.angle(vector)) + 180.0) % 360.0 - 180.0) <= 0.01
-    by_name = {(entry.channel, entry.value): bit for entry, bit in zip(REGISTERS.bits, bits, strict=True)}
-    assert by_name["", "live"]
-    assert by_name["", "speed valid"]
-    assert all(by_name[channel.name, "OK"] and by_name[channel.name, "1X valid"] for channel in REGISTERS.channels)
-    assert not any(bit for (_, name), bit in by_name.items() if name in ("alert", "danger", "any alert", "any danger"))
 
 
 def test_contents_do_not_depend_on_the_blocks(session: Samples) -> None:
@@ -215,24 +170,6 @@ def test_ten_thousand_malformed_messages_are_refused_and_nothing_moves() -> None
     assert commands == []
     assert counts["refused"] > 5000
     assert counts["closed"] > 1000
-
-
-def test_malformed_messages_over_a_socket_leave_the_server_running(session: Samples) -> None:
-    draw, commands = random.Random(2), list[str]()
-    with served(commands.append) as (port, publish), ModbusClient(port) as steady:
-        publish(np.full(58, 5.0), [True] * len(REGISTERS.bits))
-        before = steady.registers(0, 58)
-        for _ in range(300):
-            with ModbusClient(port) as hostile:
-                hostile.link.sendall(make_malformed(draw))
-                hostile.link.shutdown(1)
-                with contextlib.suppress(OSError):
-                    assert not (reply := hostile.link.recv(600)) or reply[7] & 0x80
-        assert steady.registers(0, 58) == before
-        with ModbusClient(port) as fresh:
-            assert all(fresh.bits(0, len(REGISTERS.bits)))
-            fresh.write_coil(2)
-    assert commands == ["reset"]
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,15 @@ from pathlib import Path
 
 import pytest
 
+import rig
 from drivers.console import Console
 from drivers.daq import Daq
 from rig.base.errors import InputError
 from rig.serve.transport import names
 from rig.serve.transport.endpoint import parse_loopback
-from rig.serve.transport.zenoh import ZenohServer
+from rig.serve.transport.zenoh import ZenohServer, connect_url
 from tests import processes
+from tests.waiting import PATIENCE_S
 
 
 @pytest.fixture(autouse=True)
@@ -66,8 +68,13 @@ def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
         Console.open("bench", wait_s=0.0)
     with names.register_name("bench-2", "127.0.0.1:7777"), pytest.raises(InputError, match="such as bench-2; received"):
         Daq.open("bench", wait_s=0.0)
-    with pytest.raises(InputError, match="url must be zenoh:HOST:PORT"):
-        Console.open("http://x")
+    for url in ("http://x", "", "zenoh:", "zenoh:127.0.0.1:x", ":7460", "tcp/127.0.0.1:"):
+        for connect in (Console.open, Daq.open, rig.connect):
+            with pytest.raises(InputError, match=r"url must be \[zenoh:\]HOST:PORT\[\?tls=DIR\], or the name of a rig"):
+                connect(url)
+    with ZenohServer("127.0.0.1:0") as server:
+        for url in (server.endpoint, f"zenoh:{server.endpoint}"):
+            connect_url(url, wait_s=PATIENCE_S).close()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="folders have no modes there")

@@ -50,13 +50,20 @@ class Gateway:
                 for monitor in self._contents.monitors:
                     monitor.reset()
 
-    def follow(self, client: Client, publish: Callable[[np.ndarray, list[bool]], object], stopped: Event) -> None:
+    def follow(
+        self,
+        client: Client,
+        publish: Callable[[np.ndarray, list[bool]], object],
+        stopped: Event,
+        on_start: Callable[[], object],
+    ) -> None:
         """Publish the contents of the registers from a rig's samples, to the end of its run.
 
         Args:
             client: Transport to the rig.
             publish: Receives values and bits.
             stopped: Ends it early.
+            on_start: Called once all further samples will be received.
 
         Raises:
             RefusedError: The rig has another channel table than the map.
@@ -69,6 +76,7 @@ class Gateway:
         names = list(self._map.table.channels)
         with Rig(client, channels=names, name=f"modbus {id(client)}") as rig:
             self._rig = rig
+            on_start()
             try:
                 while not stopped.is_set():
                     try:

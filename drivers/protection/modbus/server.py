@@ -1,8 +1,9 @@
 """Modbus TCP server of the gateway, by pymodbus; each request is checked before pymodbus decodes it.
 
 pymodbus accepts any value other than 0 as ON, answers an unknown function without its code, and loses a request that
-arrives before the reply to the one before. Requests are therefore checked and passed on one at a time here. A message
-that is not Modbus TCP closes its connection.
+arrives before the reply to the one before, and all that are beyond its buffer. Requests are therefore checked and
+passed on one at a time here, and a connection is read no faster than its client reads the replies. A message that is
+not Modbus TCP closes its connection.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import logging
 import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from pymodbus.constants import ExcCodes
@@ -105,7 +106,28 @@ class Server(ModbusTcpServer):
 class _Handler(ServerRequestHandler):
     """Connection of a client, with one request in work at a time."""
 
-    _busy = False
+    _busy = _is_full = _is_paused = False
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        # Above the largest part that asyncio reads at once, 256 KiB: pymodbus discards everything beyond it.
+        self.max_buffer_size = 1 << 20
+
+    def pause_writing(self) -> None:
+        """Wait with the next request: the client does not read its replies."""
+        self._is_full = True
+
+    def resume_writing(self) -> None:
+        """Take the next request."""
+        self._is_full = False
+        self._continue()
+
+    def data_received(self, data: bytes) -> None:
+        """Take the next request; read no further while others wait."""
+        super().data_received(data)
+        if (paused := bool(self.recv_buffer) and (self._busy or self._is_full)) != self._is_paused:
+            self._is_paused, transport = paused, cast("asyncio.Transport", self.transport)
+            (transport.pause_reading if paused else transport.resume_reading)()
 
     def callback_data(self, data: bytes, addr: tuple | None = None) -> int:
         """Pass on the next request, if it is complete, and return its length."""
@@ -114,7 +136,7 @@ class _Handler(ServerRequestHandler):
             self.close()
             return len(data)
         end = _HEADER_BYTES - 1 + length
-        if self._busy or len(data) <= _HEADER_BYTES or len(data) < end:
+        if self._busy or self._is_full or len(data) <= _HEADER_BYTES or len(data) < end:
             return 0
         self._busy = True
         if (fault := self.server.find_fault(data[_HEADER_BYTES:end])) is None:
@@ -132,7 +154,7 @@ class _Handler(ServerRequestHandler):
         self.loop.call_soon(self._continue)
 
     def _continue(self) -> None:
-        if self.recv_buffer and not self.is_closing:
+        if not self.is_closing:
             self.data_received(b"")
 
 

@@ -219,8 +219,8 @@ class Bench(Closing):
             BenchError: If it does not start.
         """
         if self._daqmx is None:
-            command = [sys.executable, "-m", "rig", "daqmx", "--connect", self.url, "--port", "0", "--allow-commands"]
-            self._daqmx = Program(command, self._folder / "daqmx.log")
+            command = [sys.executable, "-m", "rig", "daqmx", "--connect", self.url, "--allow-commands"]
+            self._daqmx = Program([*command, "--listen", "127.0.0.1:0"], self._folder / "daqmx.log")
             if (line := self._daqmx.wait_for(_DAQMX, self.settings.wait.start_s)) is None:
                 raise BenchError(f"rig daqmx did not start: {self._daqmx.last_line}")
             self._daqmx_port = line.partition(_DAQMX)[2].partition(";")[0]

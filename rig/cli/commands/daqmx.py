@@ -12,15 +12,17 @@ from rig.cli.connections.connection import Connection, SecretFile
 from rig.cli.output.tables import echo
 from rig.cli.signals import stop_on_signals
 
-_PORT = 31763
-"""Port of NI's own server."""
+_ADDRESS = "127.0.0.1:31763"
+"""The port is that of NI's own server."""
 _POLL_S = 0.1
 """Period at which the start of the first task is checked [s]."""
 
 
 def daqmx(
     *,
-    port: Annotated[int, typer.Option(metavar="NUMBER", help="Port on 127.0.0.1; 0: any free port")] = _PORT,
+    listen: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Address to listen on, on 127.0.0.1; port 0: any free port")
+    ] = _ADDRESS,
     device: Annotated[
         str, typer.Option(metavar="NAME", help="Name of the device in the program, such as Dev1")
     ] = "rig",
@@ -37,8 +39,8 @@ def daqmx(
 
     if not (device.isascii() and device.replace("_", "").isalnum()):
         raise InputError("--device", "letters, digits and _", printable(device))
-    address = f"127.0.0.1:{port}"
-    check_free(parse_loopback(address, field="--port", least=0), field="--port")
+    address = parse_loopback(listen, field="--listen", least=0)
+    check_free(address, field="--listen")
     for package in ("nidaqmx", "grpc"):
         require_package(package, "nidaqmx")
     from drivers.daqmx.server import DaqmxServer
@@ -47,7 +49,7 @@ def daqmx(
     done = threading.Event()
     with (
         connection.client() as client,
-        DaqmxServer(client, port=port, device=device, allow_commands=allow_commands, secret=required) as server,
+        DaqmxServer(client, port=address[1], device=device, allow_commands=allow_commands, secret=required) as server,
     ):
         for physical, channel in server.device.channels.items():
             row = server.device.table.channels[channel]

@@ -31,7 +31,9 @@ def foxglove(
     layout: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Write a layout for the app to this file, and end")
     ] = None,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Address to listen on, on 127.0.0.1")] = _ADDRESS,
+    listen: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Address to listen on, on 127.0.0.1; port 0: any free port")
+    ] = _ADDRESS,
     allow_commands: Annotated[
         bool, typer.Option("--allow-commands", help="Accept commands, and the play bar of a replay that runs")
     ] = False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -22,7 +23,9 @@ _RETRY_S = 1.0
 
 def modbus(
     *,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Address to listen on, on 127.0.0.1")] = LISTEN,
+    listen: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Address to listen on, on 127.0.0.1; port 0: any free port")
+    ] = LISTEN,
     allow_commands: Annotated[
         bool, typer.Option("--allow-commands", help="Allow clients to trip, stop and reset by coils")
     ] = False,
@@ -59,9 +62,9 @@ def _serve(listen: str, settings: dict[str, float], connection: Connection, *, a
     from drivers.protection.modbus.registers import RegisterMap
     from drivers.protection.modbus.server import serve
     from drivers.sources.stream import RigStream
-    from rig.serve.transport.endpoint import check_free, parse_loopback
+    from rig.serve.transport.endpoint import check_free, choose_listen_address
 
-    address = parse_loopback(listen, field="--listen")
+    address = choose_listen_address(listen, field="--listen")
     check_free(address, field="--listen")
     with connection.client() as client:
         registers = RegisterMap(RigStream(client).table())
@@ -73,11 +76,13 @@ def _serve(listen: str, settings: dict[str, float], connection: Connection, *, a
         access = "reads and commands" if allow_commands else "reads only"
         if allow_commands and connection.tls is not None:
             echo("rig: warning: every program here can trip and stop the rig: Modbus carries no secret", err=True)
-        echo(f"rig: Modbus TCP at {listen}, {access}; Ctrl-C ends it", err=True)
+        start = cache(
+            partial(echo, f"rig: Modbus TCP at {address[0]}:{address[1]}, {access}; Ctrl-C ends it", err=True)
+        )
         while not stopped.is_set():
             try:
                 with connection.client() as client:
-                    gateway.follow(client, publish, stopped)
+                    gateway.follow(client, publish, stopped, start)
             except (InputError, OSError, EOFError) as error:
                 if str(error) != last:
                     echo(f"rig: no rig to read, all OK bits are off: {error}", err=True)

@@ -26,6 +26,8 @@ from rig.serve.transport.endpoint import parse_endpoint
 from rig.serve.waiting import Deadline
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+FORMS = "[zenoh:]HOST:PORT[?tls=DIR], or the name of a rig"
+"""Spelling of the address of a rig."""
 _SUFFIX = ".json"
 _POLL_S = 0.1
 """Period of looking for a rig that has not started yet [s]."""
@@ -120,17 +122,16 @@ def resolve_endpoint(text: str, *, field: str, wait_s: float = 0.0) -> tuple[str
 
 
 def parse_url(url: str) -> str:
-    """Return the address part of a URL: zenoh:HOST:PORT[?tls=DIR], zenoh:NAME, or a name alone.
+    """Return the address part of a URL: zenoh:HOST:PORT[?tls=DIR] or zenoh:NAME; `zenoh:` may be left out.
 
     Raises:
         InputError: The URL has another form.
     """
-    kind, colon, rest = url.partition(":")
-    if not colon and url:
-        return url
-    if kind != "zenoh" or not rest:
-        raise InputError("url", "zenoh:HOST:PORT[?tls=DIR], or the name of a rig", url)
-    return rest
+    address = url.removeprefix("zenoh:")
+    host, colon, port = address.partition("?")[0].rpartition(":")
+    if not (host and port.isdecimal()) if colon else not port:
+        raise InputError("url", FORMS, url)
+    return address
 
 
 def _folder() -> Path:
