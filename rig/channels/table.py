@@ -33,6 +33,13 @@ LINEAR_PHASE = ("fir", "sinc")
 """Filters with a constant delay, which a recorder may have compensated."""
 
 
+@cache
+def _relative_average(order: int) -> float:
+    """Return the length of each of `order` moving averages in series, times their corner at -3 dB."""
+    x = np.linspace(0.01, 0.99, 9801)
+    return float(np.interp(-(0.5 ** (0.5 / order)), -np.sinc(x), x))
+
+
 class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Measured channel with its complete calibration; an incomplete one is refused on load."""
 
@@ -105,8 +112,7 @@ class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     @property
     def average_s(self) -> float:
         """Length of each moving average of a sinc filter [s]."""
-        x = np.linspace(0.01, 0.99, 9801)
-        return float(np.interp(-(0.5 ** (0.5 / self.filter_order)), -np.sinc(x), x)) / self.bandwidth_hz
+        return _relative_average(self.filter_order) / self.bandwidth_hz
 
     @property
     def low_pass(self) -> tuple[float | str | None, ...]:

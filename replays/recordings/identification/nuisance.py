@@ -31,7 +31,7 @@ from replays.recordings.identification.agreement import (
 )
 from replays.recordings.identification.request import first_command_s, fit_unit, observe
 from replays.recordings.resimulation.experiment import PICKUP_S, Experiment
-from replays.recordings.resimulation.noise import with_spectra
+from replays.recordings.resimulation.noise import foreseeable_s, with_spectra
 from replays.recordings.resimulation.prediction import Measured, Prediction, read_measured
 from replays.recordings.resimulation.sensitivity import (
     ANGLE,
@@ -327,9 +327,10 @@ def tune(
     channels: Sequence[str] | None = None,
     to_s: float | None = None,
     late_s: Mapping[str, float] | None = None,
+    variants: Sequence[dict[str, Any]] = (),
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Tuned:
-    """Fit the nuisance parameters of a log in windows that grow from the pulse.
+    """Fit the nuisance parameters of a log in windows that grow from the pulse, until equally valid models differ.
 
     Channels are weighted by their residuals, so that a faulty one has little influence. No value leaves
     `MAX_PRIOR_DEVIATION` standard deviations of its prior.
@@ -342,6 +343,7 @@ def tune(
         channels: Channels to use; None for all.
         to_s: End of the used samples [s].
         late_s: Assumed delay of some channels [s].
+        variants: Changes that make equally valid models.
         progress: Callback for the current step.
 
     Raises:
@@ -363,9 +365,9 @@ def tune(
     whole = {name: part.remove_delays(late_s or {}) for name, part in whole.items()}
     whole = _with_spectra(recording, baseline, whole, end_s=first_s - _MARGIN_S)
     whole = {name: _decimate(part, first_s - _FULL_RATE_S) for name, part in whole.items()}
-    fit = _fit_best(baseline, wanted, whole, progress)
+    fit = _fit_best(baseline, wanted, whole, variants, progress)
     if max(fit.scales) > _FAULTY_RMS and (early := _with_earlier_pulse(baseline, whole)) is not None:
-        other = _fit_windows(early, wanted, whole, progress, by_residuals=True, without=("hammer",))
+        other = _fit_windows(early, wanted, whole, variants, progress, by_residuals=True, without=("hammer",))
         if other.rank() > fit.rank():
             baseline, fit = early, other
     far = [key for key, value in zip(wanted, fit.values, strict=True) if _is_beyond(float(value), wanted[key])]
@@ -374,7 +376,7 @@ def tune(
         far = list(dict.fromkeys([*far, _SPEED]))
     if far:
         widened = wanted | {key: (one[0], _PRIOR_WIDENING * one[1]) for key in far if (one := wanted[key]) is not None}
-        fit = max(fit, _fit_best(baseline, widened, whole, progress), key=_WindowFit.rank)
+        fit = max(fit, _fit_best(baseline, widened, whole, variants, progress), key=_WindowFit.rank)
     half = np.hypot(1.96 * np.sqrt(np.diag(fit.covariance) + np.mean(fit.moves**2, axis=0)), fit.jackknife)
     fitted = dict(zip(wanted, fit.values.tolist(), strict=True))
     if _RATE in fitted and timed and (known := wanted.get(_SPEED)):
@@ -465,14 +467,15 @@ def _fit_best(
     baseline: Experiment,
     wanted: dict[str, tuple[float, float] | None],
     whole: dict[str, Measured],
+    variants: Sequence[dict[str, Any]],
     progress: Callable[[str], None],
 ) -> _WindowFit:
     """Return the best of several fits; if channels disagree, also fit by the majority, with and without the hammer."""
-    best = _fit_windows(baseline, wanted, whole, progress, by_residuals=False)
+    best = _fit_windows(baseline, wanted, whole, variants, progress, by_residuals=False)
     for without in ((), ("hammer",)):
         early = without and best.end_s <= _pulse_time_s(baseline) + _WINDOWS_S[0]  # its own time
         if early or (max(best.scales) > _FAULTY_RMS and (best.median_scale > _FAULTY_RMS or not without)):
-            other = _fit_windows(baseline, wanted, whole, progress, by_residuals=True, without=without)
+            other = _fit_windows(baseline, wanted, whole, variants, progress, by_residuals=True, without=without)
             best = max(best, other, key=_WindowFit.rank)
     return best
 
@@ -498,6 +501,7 @@ def _fit_windows(
     baseline: Experiment,
     wanted: dict[str, tuple[float, float] | None],
     whole: dict[str, Measured],
+    variants: Sequence[dict[str, Any]],
     progress: Callable[[str], None],
     *,
     by_residuals: bool,
@@ -509,6 +513,7 @@ def _fit_windows(
         baseline: Experiment before the fit.
         wanted: Keys to fit, with their priors.
         whole: The samples.
+        variants: Changes that make equally valid models; where these differ, the fit ends.
         progress: Callback for the current step.
         by_residuals: Weight channels by their residuals from the first step on, starting from the logged values.
         without: Channels that are not used.
@@ -535,6 +540,13 @@ def _fit_windows(
             return fit, here, [max(1.0, rms(z)) for z in here.apart]
 
         fit, here, now = fitted(values)
+        if variants and (parted_s := _find_parting(baseline, predictor, fit, variants)) is not None:
+            variants = ()
+            if parted_s > first_s + last_s:  # later samples must not bend the motion before it
+                lengths = [parted_s - first_s]
+                continue
+            if scales:
+                break
         unseen = [
             place for place, key in enumerate(wanted)
             if key not in NUISANCES and covariance[place, place] > 0.25 * priors[1, place] ** 2
@@ -558,6 +570,17 @@ def _fit_windows(
         before = np.diag(priors[1] ** -2.0), np.zeros(len(values))
         end_s, jackknife = first_s + length, jackknife_half_widths(here, times, scales, before, first_s)
     return _WindowFit(values, covariance, np.array(moves[-_COUNTED_GROWTHS:]), end_s, scales, jackknife)
+
+
+def _find_parting(
+    baseline: Experiment, predictor: Predictor, values: np.ndarray, variants: Sequence[dict[str, Any]]
+) -> float | None:
+    """Return the time from which equally valid models differ [s]; None if there is no such time."""
+    nominal = predictor.predict(values)
+    if not nominal.contacts:
+        return None
+    models = (Predictor(baseline.with_changes(changes), predictor.keys, predictor.parts) for changes in variants)
+    return foreseeable_s(predictor.parts, nominal, [model.predict(values) for model in models], share=1.0)
 
 
 def select_sound(scales: Sequence[float]) -> list[bool]:

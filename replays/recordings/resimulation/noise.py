@@ -1,15 +1,15 @@
-"""Spectrum of a log's noise, from its samples before the hammer pulse."""
+"""Noise of a log: its spectrum, and where differences between models reach it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from replays.estimate.least_squares import solve
 from replays.estimate.spectra import NoiseSpectrum
-from replays.recordings.resimulation.prediction import Measured
+from replays.recordings.resimulation.prediction import Measured, Prediction
 
 _MAX_EXCESS = 5.0
 """Largest RMS of coloured noise over white noise; more is a fault."""
@@ -48,3 +48,18 @@ def _measure(part: Measured, c: int, noise: np.ndarray) -> NoiseSpectrum | None:
     if spectrum is None or spectrum.excess > _MAX_EXCESS or spectrum.largest_line > _MAX_LINE:
         return None
     return spectrum
+
+
+def foreseeable_s(
+    parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], *, share: float
+) -> float | None:
+    """Return the first time at which equally valid runs differ by a part of the noise [s]; None if they do not."""
+    ends = []
+    for name, part in parts.items():
+        for other in others:
+            apart = np.abs(part.whiten(other.values[name] - nominal.values[name])) > share * part.floor
+            apart[:, [channel.name == "keyphasor" for channel in part.channels]] = False  # a pulse may shift by a row
+            hit = np.flatnonzero(apart.any(axis=1))
+            if len(hit):
+                ends.append(float(part.times_s[hit[0]]))
+    return min(ends, default=None)

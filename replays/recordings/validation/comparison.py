@@ -16,6 +16,7 @@ from replays.recordings.identification.nuisance import Fitted, Tuned, tune, wind
 from replays.recordings.identification.request import ask, first_command_s
 from replays.recordings.parameters import parameter_doubts
 from replays.recordings.resimulation.experiment import Experiment, is_imported
+from replays.recordings.resimulation.noise import foreseeable_s
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured, simplify
 from replays.recordings.resimulation.sensitivity import SCAN, with_values
 from replays.recordings.validation.bits import Bits, StreamBits, missing_rows
@@ -46,7 +47,6 @@ from replays.recordings.validation.trajectory import (
     ChannelResidual,
     Tolerated,
     Uncertainty,
-    foreseeable_s,
     residuals,
     scaled,
     tolerate,
@@ -356,18 +356,12 @@ def _resimulate_log(
     """Return the re-simulation of a log: unknown numbers are fitted, and their uncertainty is added to the floor."""
     rules, longest_s = criteria.imported, criteria.window.longest_s
 
-    def fit(until_s: float | None = None) -> list[Tuned]:
-        tuned = tune(
-            recording, experiment, (*rules.nuisances, *more), priors=dict.fromkeys(criteria.floating), late_s=late_s,
-            to_s=until_s, progress=lambda text: step(f"log: {text}"),
-        )  # fmt: skip
-        return [tuned, *(tuned.with_changes(variant.set) for variant in rules.variants)]
-
-    models = fit()
-    whole = read_measured(recording, models[0].baseline.scene)
-    if (parted_s := _find_parting(models, whole)) is not None:
-        models = fit(parted_s)  # later samples must not bend the motion before it
-    tuned = models[0]
+    tuned = tune(
+        recording, experiment, (*rules.nuisances, *more), priors=dict.fromkeys(criteria.floating), late_s=late_s,
+        variants=[variant.set for variant in rules.variants], progress=lambda text: step(f"log: {text}"),
+    )  # fmt: skip
+    models = [tuned, *(tuned.with_changes(variant.set) for variant in rules.variants)]
+    whole = read_measured(recording, tuned.baseline.scene)
     begin_s = window_start_s(tuned.baseline)
     parts = {
         name: part.select_until(float(part.times_s[0]) + longest_s).select_from(begin_s) for name, part in whole.items()
@@ -403,18 +397,6 @@ def _resimulate_log(
         parts=tuned.to_model_clock(parts),
         nominal=nominal, uncertainties=tuple(uncertainties), bits={}, tuned=tuned,
     )  # fmt: skip
-
-
-def _find_parting(models: Sequence[Tuned], whole: dict[str, Measured]) -> float | None:
-    """Return the time within the fit from which equally valid models differ [s]; None if there is no such time."""
-    tuned = models[0]
-    begin_s = max(window_start_s(tuned.baseline), first_command_s(tuned.baseline) - _CONTACT_MARGIN_S)
-    parts = {
-        name: part.select_from(begin_s).select_until(tuned.end_s).with_spectra(tuned.spectra)
-        for name, part in whole.items()
-    }
-    nominal, *others = (model.predict(parts) for model in models)
-    return foreseeable_s(parts, nominal, others, share=1.0)
 
 
 def _replace_pulses(

@@ -89,21 +89,6 @@ class ChannelResidual:
         return "1" if measure == "RMS" else "noise"
 
 
-def foreseeable_s(
-    parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], *, share: float
-) -> float | None:
-    """Return the first time at which equally valid runs differ by a part of the noise [s]; None if they do not."""
-    ends = []
-    for name, part in parts.items():
-        for other in others:
-            apart = np.abs(part.whiten(other.values[name] - nominal.values[name])) > share * part.floor
-            apart[:, [channel.name == "keyphasor" for channel in part.channels]] = False  # a pulse may shift by a row
-            hit = np.flatnonzero(apart.any(axis=1))
-            if len(hit):
-                ends.append(float(part.times_s[hit[0]]))
-    return min(ends, default=None)
-
-
 def floors(part: Measured, values: np.ndarray, others: Sequence[np.ndarray] = ()) -> np.ndarray:
     """Return the noise combined with the differences between equally valid predictions, shape (n, channels).
 
