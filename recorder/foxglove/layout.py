@@ -1,4 +1,4 @@
-"""Layout of the Foxglove app for the plot messages of a channel table, of a recording or of `rig foxglove`."""
+"""Layout of the Foxglove and Lichtblick apps for the plot messages of a channel table."""
 
 from __future__ import annotations
 
@@ -24,13 +24,12 @@ def make_layout(table: ChannelTable) -> bytes:
     plots = [*panels]
     panels["RosOut!events"] = {"topicToRender": VIEW_EVENTS, "minLogLevel": 1}
     panels["Parameters!scene"] = {}
-    buttons = []
+    buttons = [f"CallService!{name}" for name in SERVICES]
     for name in SERVICES:
         request = {field: form.get("default", _EXAMPLES.get(field)) for field, form in describe_fields(name).items()}
         request |= {"factor": _EXAMPLES["factor"]} if name == "fault" else {}
         settings = {"serviceName": name, "requestPayload": json.dumps(request, indent=2), "buttonText": name}
-        panels[f"CallService!{name}"] = {**settings, "layout": "vertical", "foxglovePanelTitle": name}
-        buttons.append(f"CallService!{name}")
+        panels[f"CallService!{name}"] = {**settings, "layout": "vertical", **_make_title(name)}
     right = _stack(["RosOut!events", "Parameters!scene", _stack(buttons, "row")], "column")
     layout = {
         "configById": panels,
@@ -47,7 +46,7 @@ def _make_plots(view: View) -> dict[str, dict[str, Any]]:
     plots: dict[str, dict[str, Any]] = {}
     for place, (slot, channel) in enumerate(zip(view.slots, view.channels, strict=True)):
         title = f"{'+'.join(view.groups)} [{channel.unit}]"
-        plot = plots.setdefault(title, {"foxglovePanelTitle": title, "xAxisVal": "timestamp", "paths": []})
+        plot = plots.setdefault(title, {**_make_title(title), "xAxisVal": "timestamp", "paths": []})
         plot |= {"followingViewWidth": _WINDOW_S, "showLegend": True, "isSynced": True, "showXAxisLabels": True}
         # The index, because not every program with this layout format can filter parallel arrays by name.
         path = f'"{view.topic}".{slot}[{place}]'
@@ -55,10 +54,14 @@ def _make_plots(view: View) -> dict[str, dict[str, Any]]:
     return plots
 
 
+def _make_title(title: str) -> dict[str, str]:
+    """Return the title of a panel, as Foxglove and as Lichtblick name it."""
+    return {"foxglovePanelTitle": title, "lichtblickPanelTitle": title}
+
+
 def _stack(parts: list[Any], direction: str) -> Any:
     """Return parts of equal size side by side (`row`) or below each other (`column`)."""
     if len(parts) == 1:
         return parts[0]
-    first, *rest = parts
-    share = 100.0 / len(parts)
-    return {"direction": direction, "first": first, "second": _stack(rest, direction), "splitPercentage": share}
+    second = _stack(parts[1:], direction)
+    return {"direction": direction, "first": parts[0], "second": second, "splitPercentage": 100.0 / len(parts)}

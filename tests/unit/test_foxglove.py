@@ -209,6 +209,8 @@ def test_the_play_bar_moves_a_replay(tmp_path: Path) -> None:
 def test_the_layout_has_each_channel_once(tmp_path: Path) -> None:
     layout = json.loads(make_layout(default_table()))
     panels = layout["configById"]
+    # Fields that Lichtblick 1.28.1 requires when it imports a layout.
+    assert (layout["globalVariables"], layout["userNodes"], layout["playbackConfig"]) == ({}, {}, {"speed": 1})
     placed = re.findall(r'"(\w+!.*?)"[,}]', json.dumps(layout["layout"]))
     assert sorted(placed) == sorted(panels)
     paths = [path for panel in panels.values() for path in panel.get("paths", ())]
@@ -224,6 +226,7 @@ def test_the_layout_has_each_channel_once(tmp_path: Path) -> None:
         panel = panels[f"CallService!{name}"]
         assert panel["serviceName"] == name
         assert None not in json.loads(panel["requestPayload"]).values()
+        assert panel["foxglovePanelTitle"] == panel["lichtblickPanelTitle"] == name
 
 
 def decode(data: bytes) -> Any:
