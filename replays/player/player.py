@@ -8,7 +8,6 @@ ever dropped because it is late.
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -31,13 +30,8 @@ from rig.serve.transport import Server
 from rig.serve.waiting import Deadline
 
 _ACCEPTED_COMMANDS = (*REPLAY_COMMANDS, "step", "stop")
-_MAX_AHEAD_S = 30.0
-_MAX_AHEAD_BLOCKS = 2000
-"""Lead of a burst over the slowest client that acknowledges: below the depth of the transport per key (3000 blocks) and
-the buffer of a recorder (90 s of the default streams)."""
 _POLL_S = 0.1
 _BURST_POLL_S = 2e-3
-_MIN_WAIT_REPORTED_S = 5.0
 _MAX_STEP_S = 3600
 """Longest single step [s of simulated time]."""
 
@@ -124,8 +118,6 @@ class Player(ServedRun):
         self._wait_s = wait_s
         self._hold = hold
         self._step: _PlayStep | None = None
-        self._held: tuple[str, float] | None = None
-        """Client that limits a burst, and the time since when it does [s, monotonic]."""
         self._pending_warnings: deque[str] = deque()
         """Warnings for the playing thread to publish."""
         self._woken = threading.Event()
@@ -202,8 +194,6 @@ class Player(ServedRun):
             warnings.append(
                 f"x{self._playhead.rate:g} is faster than this machine and its clients: late by {behind_s:.1f} s"
             )
-        if self._held is not None and (held_s := time.monotonic() - self._held[1]) > _MIN_WAIT_REPORTED_S:
-            warnings.append(f"has waited {held_s:.0f} s for client {self._held[0]} to receive the data")
         return warnings
 
     def _scene_document(self) -> dict[str, Any]:
@@ -277,7 +267,7 @@ class Player(ServedRun):
             if self._playhead.release(step.until_ns):
                 self._end_step(step, step.until_ns)
             return
-        if self._burst and self._is_client_behind():
+        if self._burst and self._is_client_behind(self.published, self._outlet.rate_hz, self._outlet.block_rows):
             self._wait(_BURST_POLL_S)
             return
         if not self._playhead.release(instant_ns):
@@ -299,16 +289,6 @@ class Player(ServedRun):
         """Wait for a time or until a command arrives."""
         self._woken.wait(seconds)
         self._woken.clear()
-
-    def _is_client_behind(self) -> bool:
-        """Return whether the data sent exceed what a client has acknowledged by too much."""
-        rows = min(_MAX_AHEAD_S * self._outlet.rate_hz, _MAX_AHEAD_BLOCKS * self._outlet.block_rows)
-        name = self._handler.clients.find_lagging(self.published, round(rows)) if rows > 0 else None
-        if name is None:
-            self._held = None
-        elif self._held is None or self._held[0] != name:
-            self._held = name, time.monotonic()
-        return name is not None
 
     def _open(self, from_ns: int) -> ReadAhead[Batch | Mark]:
         """Start reading at a position of the recording."""

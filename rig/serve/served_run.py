@@ -19,6 +19,11 @@ _SUMMARY_FIGURES = (
     "samples_published", "commands", "replay",
 )  # fmt: skip
 """Values of the last status that the summary contains."""
+_MAX_AHEAD_S = 30.0
+_MAX_AHEAD_BLOCKS = 2000
+"""Lead of a run without a clock over the slowest client that acknowledges: below the depth of the transport per key
+(3000 blocks) and the buffer of a recorder (90 s of the default streams)."""
+_MIN_WAIT_REPORTED_S = 5.0
 
 
 class ServedRun(ABC):
@@ -52,6 +57,8 @@ class ServedRun(ABC):
         self._prepared = False
         self._stop_requested = False
         self._accepted = 0
+        self._held: tuple[str, float] | None = None
+        """Client that limits the pace, and the time since when it does [s, monotonic]."""
         self._handler = RequestHandler(server, wake=self._wake, on_warning=self._warn, **handler_settings)
 
     # ---- to be implemented by subclasses ----
@@ -140,7 +147,7 @@ class ServedRun(ABC):
                 "energy": health.get("energy", {}),
                 "engine": health.get("engine", {}),
                 "accuracy": health.get("accuracy"),
-                "warnings": warnings + self._handler.warnings(),
+                "warnings": [*warnings, *self._describe_wait(), *self._handler.warnings()],
                 "remarks": health.get("remarks", []),
                 "samples_published": self.published,
                 "commands": self._accepted,
@@ -150,7 +157,22 @@ class ServedRun(ABC):
     def _event(self, name: str, tick: int, **fields: Any) -> dict[str, Any]:
         return {"event": name, "tick": tick, "time_s": tick / self._rate, "wall_s": time.time(), **fields}
 
+    def _describe_wait(self) -> list[str]:
+        if (held := self._held) is None or (held_s := time.monotonic() - held[1]) <= _MIN_WAIT_REPORTED_S:
+            return []
+        return [f"has waited {held_s:.0f} s for client {held[0]} to receive the data"]
+
     # ---- on the run's thread ----
+
+    def _is_client_behind(self, produced: int, rate_hz: float, block_rows: float) -> bool:
+        """Return whether the rows produced exceed those that a client has acknowledged by too much."""
+        rows = min(_MAX_AHEAD_S * rate_hz, _MAX_AHEAD_BLOCKS * block_rows)
+        name = self._handler.clients.find_lagging(produced, round(rows)) if rows > 0 else None
+        if name is None:
+            self._held = None
+        elif self._held is None or self._held[0] != name:
+            self._held = name, time.monotonic()
+        return name is not None
 
     def prepare(self) -> None:
         """Prepare, start to answer requests and publish the rig's token; `run` calls it if it was not called before."""

@@ -55,6 +55,7 @@ _MAX_HELD = 256
 """Commands that may wait for other devices."""
 _UNLIMITED_HZ = 1e9
 """Commands per second of one sender in lockstep: no limit."""
+_CLIENT_POLL_S = 2e-3
 _QUEUE_WARNING_S = 1.0
 """Waiting time of blocks above which a warning is shown [s]."""
 
@@ -254,6 +255,10 @@ class Service(ServedRun):
             if not self._may_drop and not queue.wait_for_room(0.1):
                 self._defer(events)
                 continue
+            if clock.pace == "free" and self._must_wait():
+                self._defer(events)
+                time.sleep(_CLIENT_POLL_S)
+                continue
             ticks = clock.grant(ticks_due)
             if ticks == 0:
                 self._defer(events)
@@ -273,6 +278,12 @@ class Service(ServedRun):
             )
             self._report_overflow(queue.push(entry))
             self._refresh_health()
+
+    def _must_wait(self) -> bool:
+        """Return whether a client has received too little of what was produced."""
+        rate_hz = self._samples_rate_hz
+        block_rows = rate_hz * self._block_ticks / self._rate
+        return self._is_client_behind(self.published + round(self._queue.used * block_rows), rate_hz, block_rows)
 
     def _defer(self, events: list[dict[str, Any]]) -> None:
         """Publish events without a block."""

@@ -14,7 +14,6 @@ import pytest
 
 from drivers.console import Console
 from recorder.reader import Recording, join
-from replays.player import player as player_module
 from replays.player.edit import Edit
 from replays.player.messages import Track
 from replays.player.play_range import Part
@@ -23,6 +22,7 @@ from replays.player.timeline import By, Timeline
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError
 from rig.channels.table import ChannelTable
+from rig.serve import served_run
 from rig.serve.pacing import FreeRun, RealTime
 from rig.serve.service import REPLAY_COMMANDS, Service
 from rig.serve.transport.clients import Clients
@@ -502,7 +502,7 @@ def test_a_stop_ends_the_stream_well(track: Track) -> None:
 
 
 def test_a_burst_waits_for_the_clients_reports(track: Track, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(player_module, "_MAX_AHEAD_BLOCKS", 10)
+    monkeypatch.setattr(served_run, "_MAX_AHEAD_BLOCKS", 10)
     with running(track, clock=FreeRun(), paused=True) as (_, client_log, console):
         client = client_log.client
         client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 0}')

@@ -15,6 +15,7 @@ from rig.base import wire
 from rig.base.errors import InputError, RefusedError
 from rig.cli.output.display import accuracy_text
 from rig.run.simulation import Frame
+from rig.serve import served_run
 from rig.serve.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
 from rig.serve.service import Service
 from rig.serve.transport import NoReplyError
@@ -459,6 +460,28 @@ def test_a_client_that_leaves_is_not_a_lagging_one() -> None:
         for document in ({"received_index": 5}, {"received_index": 5, "done": True}):
             client.report(f"{wire.CLIENTS}/recorder", json.dumps(document).encode())
             assert ("recorder" in rig.console.status()["clients"]) is ("done" not in document)
+
+
+def test_a_run_as_fast_as_clients_read_waits_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(served_run, "_MAX_AHEAD_BLOCKS", 10)
+    monkeypatch.setattr(served_run, "_MIN_WAIT_REPORTED_S", -1.0)
+    running = Running(FakeSimulation(duration_s=None), FreeRun())
+    running.service.prepare()
+    running.listener.client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 0, "room": 100000}')
+    with running as rig:
+
+        def waits() -> bool:
+            status = rig.console.status()
+            return any("for client slow" in text for text in status["warnings"]) and not status["queue"]["depth"]
+
+        until(waits)
+        published = rig.service.published
+        assert rig.console.hammer(force_n=100.0).tick * 20_000 == published * 1_000_000, (
+            "commands are answered in the meantime"
+        )
+        assert rig.service.published == published
+        rig.listener.client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 0, "done": true}')
+        until(lambda: rig.service.published > published)
 
 
 def test_the_number_of_clients_is_bounded() -> None:
