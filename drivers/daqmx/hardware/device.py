@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from nidaqmx.constants import AcquisitionType, BusType, ProductCategory, UsageTypeCI
+from nidaqmx.constants import AcquisitionType, BusType, ProductCategory
 from nidaqmx.utils import unflatten_channel_string
 
+from drivers.console import Console
 from drivers.daqmx.hardware.errors import Code, DaqmxError
-from drivers.daqmx.hardware.scaling import CALLS
+from drivers.daqmx.hardware.scaling import CALLS, COUNTER_CALLS
 from rig.channels.orbit import PULSE_LEVEL
 from rig.channels.table import Channel, ChannelTable
 
 _HAMMER_LEVEL_N = 10.0
 """Force at which the digital terminal of the hammer rises [N], far above the noise of its channel."""
 _AI_USAGES = [usage.value for usage, _ in CALLS.values()]
-_CI = (
-    UsageTypeCI.COUNT_EDGES,
-    UsageTypeCI.FREQUENCY,
-    UsageTypeCI.PERIOD,
-    UsageTypeCI.PULSE_FREQ,
-    UsageTypeCI.PULSE_TIME,
-)
-_CI_USAGES = [usage.value for usage in _CI]
-OUTPUT_LINES = {
-    "port0/line0": "hit", "port0/line1": "stop", "port0/line2": "", "port0/line3": "",
-    "port2/line0": "trip", "port2/line1": "release",
+_CI_USAGES = [usage.value for usage, _ in COUNTER_CALLS.values()]
+OUTPUT_LINES: dict[str, Callable[[Console], Any] | None] = {
+    "port0/line0": Console.hammer, "port0/line1": lambda console: console.speed(0.0),
+    "port0/line2": None, "port0/line3": None, "port2/line0": Console.stop, "port2/line1": Console.release,
 }  # fmt: skip
-"""Action at the rising edge of each output line, if any. A pattern for a whole port0 does not end the run."""
+"""Command at the rising edge of each output line, if any. A pattern for a whole port0 does not end the run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,20 +52,16 @@ class Device:
         self.table = table
         self.channels = dict(zip((f"{name}/ai{n}" for n in range(len(table.channels))), table.channels, strict=True))
         """Channel of the table by physical analogue input, in table order."""
-        terminals = {"hammer": Terminal("hammer", _HAMMER_LEVEL_N), "keyphasor": Terminal("keyphasor", PULSE_LEVEL)}
-        self._terminals = {name: terminal for name, terminal in terminals.items() if name in table.channels}
+        terminals = {"PFI0": Terminal("hammer", _HAMMER_LEVEL_N), "PFI8": Terminal("keyphasor", PULSE_LEVEL)}
+        self.terminals = {f"/{name}/{pin}": one for pin, one in terminals.items() if one.channel in table.channels}
+        """Digital terminals by name."""
         self.lines = {f"{name}/{line}": line for line in OUTPUT_LINES}
         """Output lines, without the device."""
-        signals = enumerate(self._terminals.values())
-        self.inputs = {f"{name}/port1/line{n}": terminal for n, terminal in signals}
+        self.inputs = {f"{name}/port1/line{n}": one for n, one in enumerate(self.terminals.values())}
         """Signal of each input line."""
-        self.counters = [f"{name}/ctr0"] if "keyphasor" in self._terminals else []
-
-    @property
-    def terminals(self) -> dict[str, Terminal]:
-        """Digital terminals by name."""
-        numbers = {"hammer": "PFI0", "keyphasor": "PFI8"}
-        return {f"/{self.name}/{numbers[name]}": terminal for name, terminal in self._terminals.items()}
+        self.counters = [f"{name}/ctr0"] if "keyphasor" in table.channels else []
+        self.analog_outputs = [f"{name}/ao0"] if "speed" in table.channels else []
+        """Physical analogue outputs: the set point of the drive."""
 
     def find_terminal(self, name: str) -> Terminal:
         """Return the signal of a digital terminal.
@@ -85,7 +76,7 @@ class Device:
         return found[key]
 
     def expand(self, text: str, known: Any) -> list[str]:
-        """Return the physical channels of a list or range, such as `rig/ai0:3`.
+        """Return the physical channels of a list or range, such as `rig/ai0:3`; a port stands for all of its lines.
 
         Args:
             text: The list.
@@ -94,13 +85,14 @@ class Device:
         Raises:
             DaqmxError: A device or a channel does not exist.
         """
-        found = {name.lower(): name for name in known}
-        names = [name.strip().lstrip("/") for name in unflatten_channel_string(text)]
-        for name in names or [text]:
+        found: list[str] = []
+        for name in [each.strip().lstrip("/") for each in unflatten_channel_string(text)] or [text]:
             self.check_name(name.partition("/")[0])
-            if name.lower() not in found:
+            matches = [one for one in known if name.lower() in (one.lower(), one.lower().rpartition("/line")[0])]
+            if not matches:
                 raise DaqmxError(Code.PHYSICAL_CHAN_DOES_NOT_EXIST, f"{name}; this device has {', '.join(known)}")
-        return [found[name.lower()] for name in names]
+            found += matches
+        return found
 
     def check_name(self, name: str) -> None:
         """Raise an error unless this is the name of the device.
@@ -110,19 +102,6 @@ class Device:
         """
         if name.lower() != self.name.lower():
             raise DaqmxError(Code.INVALID_DEVICE_ID, f"{name or 'no name'}; the device is {self.name}")
-
-    def expand_lines(self, text: str, known: Any) -> list[str]:
-        """Return the lines of a list, in which a port stands for all of its lines.
-
-        Raises:
-            DaqmxError: A line does not exist.
-        """
-        names = []
-        for name in unflatten_channel_string(text):
-            port = name.strip().lstrip("/").lower()
-            lines = [line for line in known if line.lower().startswith(f"{port}/line")]
-            names += lines or self.expand(name, known)
-        return names or self.expand(text, known)
 
     def attributes(self) -> dict[str, Any]:
         """Return the properties of the device, by their names in the protocol."""
@@ -159,11 +138,6 @@ class Device:
             "PHYSICAL_CHAN_DI_SAMP_CLK_SUPPORTED": name in self.inputs,
             "PHYSICAL_CHAN_DO_SAMP_CLK_SUPPORTED": name in self.lines,
         }  # fmt: skip
-
-    @property
-    def analog_outputs(self) -> list[str]:
-        """Physical analogue outputs: the set point of the drive."""
-        return [f"{self.name}/ao0"] if "speed" in self.table.channels else []
 
     def channel(self, physical: str) -> Channel:
         """Return the row of the channel table of a physical analogue input."""

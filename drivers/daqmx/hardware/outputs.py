@@ -12,10 +12,6 @@ from drivers.daqmx.hardware.errors import Code, DaqmxError
 from rig.base.errors import InputError, RefusedError
 from rig.channels.table import Channel
 
-_ACTIONS: dict[str, Callable[[Console], Any]] = {
-    "hit": Console.hammer, "stop": lambda console: console.speed(0.0), "trip": Console.stop, "release": Console.release,
-}  # fmt: skip
-
 
 class Outputs:
     """States of the outputs, shared by all tasks.
@@ -32,16 +28,17 @@ class Outputs:
         self.lines = dict.fromkeys(OUTPUT_LINES, False)
         """State of each line."""
 
-    def check(self) -> None:
-        """Raise an error unless commands are allowed.
+    def check(self) -> Console:
+        """Return the console of the rig.
 
         Raises:
-            DaqmxError: They are not.
+            DaqmxError: Commands are not allowed.
         """
         if self._console is None:
             raise DaqmxError(
                 Code.RESOURCE_ALREADY_RESERVED, "outputs command the rig; start `rig daqmx` with --allow-commands"
             )
+        return self._console
 
     def set_lines(self, *samples: dict[str, bool]) -> None:
         """Set lines, sample after sample; rising edges send the command of their line, once for all samples.
@@ -50,16 +47,16 @@ class Outputs:
             DaqmxError: The rig refused a command; the others were sent.
         """
         self.check()
-        actions: dict[str, None] = {}
+        commands: dict[Callable[[Console], Any], None] = {}
         failures: list[DaqmxError] = []
         with self._lock:
             for line, state in (item for states in samples for item in states.items()):
-                if state and not self.lines[line] and OUTPUT_LINES[line]:
-                    actions[OUTPUT_LINES[line]] = None
+                if state and not self.lines[line] and (command := OUTPUT_LINES[line]) is not None:
+                    commands[command] = None
                 self.lines[line] = state
-            for action in actions:
+            for command in commands:
                 try:
-                    self._command(_ACTIONS[action])
+                    self._command(command)
                 except DaqmxError as error:
                     failures.append(error)
         if failures:
@@ -71,15 +68,13 @@ class Outputs:
         Raises:
             DaqmxError: The rig refused it.
         """
-        self.check()
         assert self._speed is not None
         hertz = (volts - self._speed.bias_v) / self._speed.sensitivity_v
         with self._lock:
             self._command(lambda console: console.speed(hertz))
 
     def _command(self, command: Callable[[Console], Any]) -> None:
-        assert self._console is not None
         try:
-            command(self._console)
+            command(self.check())
         except (RefusedError, InputError) as error:
             raise DaqmxError(Code.INVALID_AO_DATA_WRITE, f"the rig refused the command: {error}") from None

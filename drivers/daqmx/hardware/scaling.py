@@ -1,4 +1,4 @@
-"""Scales of analogue input channels: from volts to the unit of a measurement, as the program defines it."""
+"""Measurements of input channels, and the scales of analogue ones, from volts to the unit that a program defines."""
 
 from __future__ import annotations
 
@@ -13,12 +13,8 @@ _GRAVITY, _POUND, _INCH, _MIL = 9.80665, 4.4482216152605, 25.4e-3, 25.4e-6
 """Standard gravity [m/s^2], pound-force [N], inch and mil [m]."""
 _MAX_FACTOR = 1e15
 """Largest factor of a scale, and inverse of the smallest one: products of three are finite and not zero."""
-_Accel, _Force, _Probe = (
-    c.AccelSensitivityUnits,
-    c.ForceIEPESensorSensitivityUnits,
-    c.EddyCurrentProxProbeSensitivityUnits,
-)
-_Velocity = c.VelocityIEPESensorSensitivityUnits
+_Accel, _Force = c.AccelSensitivityUnits, c.ForceIEPESensorSensitivityUnits
+_Probe, _Velocity = c.EddyCurrentProxProbeSensitivityUnits, c.VelocityIEPESensorSensitivityUnits
 _UNITS: dict[Any, float] = {
     c.VoltageUnits.VOLTS: 1.0, c.BridgeUnits.VOLTS_PER_VOLT: 1.0, c.BridgeUnits.MILLIVOLTS_PER_VOLT: 1e-3,
     c.AccelUnits.G: _GRAVITY, c.AccelUnits.METERS_PER_SECOND_SQUARED: 1.0,
@@ -46,6 +42,14 @@ CALLS = {
     "CreateAIForceBridgeTwoPointLinChan": (c.UsageTypeAI.FORCE_BRIDGE, "AI_FORCE"),
 }
 """Measurement and prefix of the properties, by the call that creates a channel."""
+COUNTER_CALLS = {
+    "CreateCICountEdgesChan": (c.UsageTypeCI.COUNT_EDGES, "CI_COUNT_EDGES_ACTIVE_EDGE"),
+    "CreateCIFreqChan": (c.UsageTypeCI.FREQUENCY, "CI_FREQ_STARTING_EDGE"),
+    "CreateCIPeriodChan": (c.UsageTypeCI.PERIOD, "CI_PERIOD_STARTING_EDGE"),
+    "CreateCIPulseChanFreq": (c.UsageTypeCI.PULSE_FREQ, "CI_PULSE_FREQ_START_EDGE"),
+    "CreateCIPulseChanTime": (c.UsageTypeCI.PULSE_TIME, "CI_PULSE_TIME_START_EDGE"),
+}
+"""Measurement and property of the first edge, by the call that creates a channel."""
 
 
 def get_scale(request: Any, channel: Channel) -> tuple[float, float]:
@@ -62,10 +66,8 @@ def get_scale(request: Any, channel: Channel) -> tuple[float, float]:
     """
     unit = _get_size(_UNITS, request, "units")
     if hasattr(request, "sensitivity"):
-        sensitivity = _check(request.sensitivity, "sensitivity") * _get_size(
-            _SENSITIVITIES, request, "sensitivity_units"
-        )
-        gain = 1.0 / (sensitivity * unit)
+        size = _get_size(_SENSITIVITIES, request, "sensitivity_units")
+        gain = 1.0 / (_check(request.sensitivity, "sensitivity") * size * unit)
         return gain, -channel.bias_v * gain if hasattr(request, "current_excit_val") else 0.0
     if not hasattr(request, "voltage_excit_val"):
         return 1.0 / unit, 0.0

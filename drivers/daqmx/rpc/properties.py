@@ -9,7 +9,7 @@ from drivers.daqmx.rpc.calls import call
 from drivers.daqmx.rpc.sessions import Sessions
 from drivers.daqmx.tasks.settings import DEFAULTS
 
-DRIVER_VERSION = (25, 5, 0)
+DRIVER_VERSION = {"NIDAQ_MAJOR_VERSION": 25, "NIDAQ_MINOR_VERSION": 5, "NIDAQ_UPDATE_VERSION": 0}
 """Version of the driver that the device reports."""
 _UNNAMED = {0x31E8: "DEFAULT_NUMBER_OF_SAMPLES_TO_READ"}
 """Properties without a name in the protocol."""
@@ -48,9 +48,7 @@ class Properties(Sessions):
     def _read(self, scope: str, request: Any) -> dict[str, Any]:
         device = self._device
         if scope == "System":
-            names = {"DEV_NAMES": device.name, "TASKS": "", "SCALES": "", "GLOBAL_CHANS": ""}
-            parts = ("NIDAQ_MAJOR_VERSION", "NIDAQ_MINOR_VERSION", "NIDAQ_UPDATE_VERSION")
-            return names | dict(zip(parts, DRIVER_VERSION, strict=True))
+            return {"DEV_NAMES": device.name, "TASKS": "", "SCALES": "", "GLOBAL_CHANS": ""} | DRIVER_VERSION
         if scope == "Device":
             device.check_name(request.device_name)
             return device.attributes()

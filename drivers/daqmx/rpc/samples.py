@@ -14,12 +14,6 @@ from drivers.daqmx.rpc.calls import call
 from drivers.daqmx.rpc.properties import Properties
 from drivers.daqmx.tasks.task import POLL_S, Task
 from drivers.sources.samples import Samples
-from rig.base.errors import RefusedError
-
-_KINDS = {
-    "Analog": ChannelType.ANALOG_INPUT, "Binary": ChannelType.ANALOG_INPUT,
-    "Counter": ChannelType.COUNTER_INPUT, "Ctr": ChannelType.COUNTER_INPUT,
-}  # fmt: skip
 
 _MAX_ON_DEMAND = 10_000
 """Largest number of samples of a write without a sample clock, which sets them one after another."""
@@ -35,20 +29,20 @@ class DaqmxServicer(Properties):
         self, request: Any, context: Any, response: Any, family: str, first: str | None, kind: str, last: str | None
     ) -> None:
         """Read analogue inputs, scaled or as counts, or the counter."""
-        task, scalar = self.task(request), "Scalar" in (first, last)
-        _check_kind(task, _KINDS[family])
+        task = self.task(request, ChannelType.COUNTER_INPUT if family.startswith("C") else ChannelType.ANALOG_INPUT)
+        scalar = "Scalar" in (first, last)
         if scalar and len(task.channels) > 1:
             raise DaqmxError(Code.ONE_CHAN_READ_FOR_MULTI_CHAN_TASK, "read an array")
         if kind == "I16" and any(channel.fixed["AI_RAW_SAMP_SIZE"] > 16 for channel in task.channels):
             raise DaqmxError(Code.READ_DATA_TYPE_TOO_SMALL, "the converter has more than 16 bits; read 32 bits")
         fields = [one.name for one in response.DESCRIPTOR.fields if one.name not in ("status", "samps_per_chan_read")]
         counter = task.counter
-        if counter is not None and counter.clocked and task.reads_newest:
+        if counter is not None and counter.clocked and not task.clocked:
             values, status = np.array([[counter.count]]), 0
         else:
             count = 1 if scalar else request.num_samps_per_chan
             samples, status = task.read(count, request.timeout, context.is_active)
-            values = self._scale(task, samples) if family == "Analog" else samples.values
+            values = _scale(task, samples) if family == "Analog" else samples.values
         width = len(fields) if task.kind is ChannelType.COUNTER_INPUT else len(task.channels)
         if len(values) and (values.shape[1] != width or (kind == "U32" and values.dtype.kind == "f")):
             raise DaqmxError(Code.INCORRECT_READ_FUNCTION, "the counter measures something else")
@@ -67,12 +61,11 @@ class DaqmxServicer(Properties):
     @call("ReadAnalogWaveforms")
     def read_waveforms(self, request: Any, context: Any, response: Any) -> None:
         """Read scaled samples with their simulated times, counted from the epoch of the format, 1904."""
-        task = self.task(request)
-        _check_kind(task, ChannelType.ANALOG_INPUT)
+        task = self.task(request, ChannelType.ANALOG_INPUT)
         samples, response.status = task.read(request.num_samps_per_chan, request.timeout, context.is_active)
         response.samps_per_chan_read = len(samples)
         ticks = round(samples.tick * 2**64 / samples.tick_rate_hz)
-        for channel, column in zip(task.channels, self._scale(task, samples).T, strict=True):
+        for channel, column in zip(task.channels, _scale(task, samples).T, strict=True):
             waveform = response.waveforms.add(dt=1.0 / samples.rate_hz, y_data=column.tolist())
             waveform.t0.seconds, waveform.t0.fractional_seconds = divmod(ticks, 2**64)
             waveform.attributes["NI_ChannelName"].string_value = channel.name
@@ -80,8 +73,7 @@ class DaqmxServicer(Properties):
     @call("ReadRaw")
     def read_raw(self, request: Any, context: Any, response: Any) -> None:
         """Read counts as bytes, sample after sample, with all channels of a sample together."""
-        task = self.task(request)
-        _check_kind(task, ChannelType.ANALOG_INPUT)
+        task = self.task(request, ChannelType.ANALOG_INPUT)
         size = max(channel.fixed["AI_RAW_SAMP_SIZE"] for channel in task.channels) // 8
         samples, response.status = task.read(request.num_samps_per_chan, request.timeout, context.is_active)
         response.read_array = samples.values.astype(f"<i{size}").tobytes()
@@ -89,18 +81,13 @@ class DaqmxServicer(Properties):
             raise DaqmxError(Code.READ_BUFFER_TOO_SMALL, f"{len(response.read_array)} bytes were read")
         response.samps_read, response.num_bytes_per_samp = len(samples), size
 
-    def _scale(self, task: Task, samples: Samples) -> np.ndarray:
-        volts = [self._device.channel(channel.physical[0]).lsb_v for channel in task.channels]
-        gain = [lsb_v * channel.gain for lsb_v, channel in zip(volts, task.channels, strict=True)]
-        return samples.values * np.array(gain) + np.array([channel.offset for channel in task.channels])
-
     # ---- digital lines ----
 
     @call("ReadDigital(Lines|U32|ScalarU32)")
     def read_lines(self, request: Any, context: Any, response: Any, kind: str) -> None:
         """Read lines as one byte each, or as the bits of a number."""
-        task, count, columns = self.task(request), 1, {}
-        _check_kind(task, ChannelType.DIGITAL_INPUT, ChannelType.DIGITAL_OUTPUT)
+        task = self.task(request, ChannelType.DIGITAL_INPUT, ChannelType.DIGITAL_OUTPUT)
+        count, columns = 1, {}
         lines, device = [channel.physical for channel in task.channels], self._device
         if task.kind is ChannelType.DIGITAL_INPUT and task.plan()[0]:
             wanted = 1 if kind == "ScalarU32" else request.num_samps_per_chan
@@ -136,10 +123,8 @@ class DaqmxServicer(Properties):
     @call("WriteDigital(Lines|U32|ScalarU32|Waveforms)")
     def write_lines(self, request: Any, _: Any, response: Any, kind: str) -> None:
         """Set lines, given as one byte each or as the bits of a number; with a sample clock, at the clock."""
-        task = self.task(request)
-        _check_write(task, ChannelType.DIGITAL_OUTPUT)
+        task = self.task(request, ChannelType.DIGITAL_OUTPUT, mismatch=Code.WRITE_CHAN_TYPE_MISMATCH)
         lines = [channel.physical for channel in task.channels]
-        bytewise = kind in ("Lines", "Waveforms")
         if kind == "Waveforms":
             signals = [
                 np.frombuffer(each.y_data, np.uint8).reshape(-1, max(1, each.signal_count))[:, ::-1]  # line 0 is last
@@ -152,11 +137,9 @@ class DaqmxServicer(Properties):
             signals = list(_unfill(data, request, (len(lines), max(map(len, lines)))).swapaxes(0, 1))
         else:
             data = np.array([request.value] if kind == "ScalarU32" else request.write_array, dtype=np.int64)
-            signals = list(_unfill(data, request, (len(lines),)).T)
-        states = np.stack([
-            values[:, place] if bytewise else values >> _get_line(line) & 1
-            for group, values in zip(lines, signals, strict=True) for place, line in enumerate(group)
-        ], axis=1).astype(bool)  # fmt: skip
+            columns = zip(lines, _unfill(data, request, (len(lines),)).T, strict=True)
+            signals = [values[:, None] >> np.array([*map(_get_line, group)]) & 1 for group, values in columns]
+        states = np.hstack([each[:, : len(group)] for group, each in zip(lines, signals, strict=True)]).astype(bool)
         names = [self._device.lines[line] for group in lines for line in group]
 
         def get_states(number: int) -> dict[str, bool]:
@@ -164,9 +147,7 @@ class DaqmxServicer(Properties):
 
         if task.clocked and len(states):
             task.output = lambda numbers: self._generate([get_states(number) for number in numbers])
-        elif not task.clocked:
-            _check_on_demand(states)
-        self._start(task, request)
+        self._start(task, request, len(states))
         for number in range(0 if task.clocked else len(states)):
             self._outputs.set_lines(get_states(number))
         if kind != "ScalarU32":
@@ -174,18 +155,16 @@ class DaqmxServicer(Properties):
 
     def _generate(self, samples: list[dict[str, bool]]) -> None:
         """Set lines at the clock; like a signal without feedback, an edge that the rig refuses has no effect."""
-        with contextlib.suppress(DaqmxError, RefusedError, ConnectionError):
+        with contextlib.suppress(DaqmxError, ConnectionError):
             self._outputs.set_lines(*samples)
 
     @call("WriteAnalog(Scalar)?F64")
     def write_volts(self, request: Any, _: Any, response: Any, scalar: str | None) -> None:
         """Set the set point of the drive."""
-        task = self.task(request)
-        _check_write(task, ChannelType.ANALOG_OUTPUT)
-        _check_on_demand(request.write_array if not scalar else ())
-        self._start(task, request)
-        limits = task.channels[0].attributes
+        task = self.task(request, ChannelType.ANALOG_OUTPUT, mismatch=Code.WRITE_CHAN_TYPE_MISMATCH)
         values = [request.value] if scalar else list(request.write_array)
+        self._start(task, request, len(values))
+        limits = task.channels[0].attributes
         for volts in values:
             if not limits["AO_MIN"] <= volts <= limits["AO_MAX"]:
                 raise DaqmxError(Code.INVALID_AO_DATA_WRITE, f"{volts:g} V is outside of the channel's limits")
@@ -193,8 +172,11 @@ class DaqmxServicer(Properties):
         if not scalar:
             response.samps_per_chan_written = len(values)
 
-    def _start(self, task: Task, request: Any) -> None:
-        """Start the task of a write."""
+    @staticmethod
+    def _start(task: Task, request: Any, count: int) -> None:
+        """Start the task of a write of a number of samples."""
+        if not task.clocked and count > _MAX_ON_DEMAND:
+            refuse_value("num_samps_per_chan", f"at most {_MAX_ON_DEMAND} without a sample clock", count)
         if not task.started and request.auto_start:
             task.start()
         elif not task.started and not task.clocked:
@@ -233,19 +215,9 @@ class DaqmxServicer(Properties):
             yield response(status=int(status if acquisition.failure is None else acquisition.failure[0]))
 
 
-def _check_kind(task: Task, *kinds: ChannelType) -> None:
-    if task.kind not in kinds:
-        raise DaqmxError(Code.READ_CHAN_TYPE_MISMATCH, f"the task has channels of the kind {task.kind.name.lower()}")
-
-
-def _check_write(task: Task, kind: ChannelType) -> None:
-    if task.kind is not kind:
-        raise DaqmxError(Code.WRITE_CHAN_TYPE_MISMATCH, "the channels of the task are of another kind")
-
-
-def _check_on_demand(samples: Any) -> None:
-    if len(samples) > _MAX_ON_DEMAND:
-        refuse_value("num_samps_per_chan", f"at most {_MAX_ON_DEMAND} without a sample clock", len(samples))
+def _scale(task: Task, samples: Samples) -> np.ndarray:
+    gain, offset = np.array([(channel.gain, channel.offset) for channel in task.channels]).T
+    return samples.values * gain + offset
 
 
 def _fill(values: np.ndarray, request: Any) -> np.ndarray:

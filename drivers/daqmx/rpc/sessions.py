@@ -18,7 +18,6 @@ from drivers.daqmx.hardware.device import Device
 from drivers.daqmx.hardware.errors import Code, DaqmxError, describe, refuse_value
 from drivers.daqmx.hardware.outputs import Outputs
 from drivers.daqmx.rpc.calls import Calls, call
-from drivers.daqmx.tasks import counters
 from drivers.daqmx.tasks.configuration import VirtualChannel
 from drivers.daqmx.tasks.task import Task
 from drivers.sources import Source
@@ -73,14 +72,21 @@ class Sessions(Calls):
                 code, f"outputs need the secret of `rig daqmx --secret FILE` as {SECRET_KEY} in the metadata"
             )
 
-    def task(self, request: Any) -> Task:
+    def task(self, request: Any, *kinds: ChannelType, mismatch: Code = Code.READ_CHAN_TYPE_MISMATCH) -> Task:
         """Return the task of a request.
 
+        Args:
+            request: The request.
+            kinds: Kinds of channels for which the call is made; by default any.
+            mismatch: Code of the error if the task has channels of another kind.
+
         Raises:
-            DaqmxError: It does not exist.
+            DaqmxError: It does not exist, or has channels of another kind.
         """
         if (task := self._tasks.get(request.task.name)) is None:
             raise DaqmxError(Code.INVALID_TASK, f"{request.task.name!r} was cleared, or never created")
+        if kinds and task.kind not in kinds:
+            raise DaqmxError(mismatch, f"the task has channels of the kind {task.kind.name.lower()}")
         return task
 
     # ---- tasks ----
@@ -99,27 +105,17 @@ class Sessions(Calls):
             self._tasks.setdefault(name, Task(name, self._device, self._open_source))
         response.task.name, response.new_session_initialized = name, not exists
 
-    @call("ClearTask|StopTask")
-    def stop_task(self, request: Any, _: Any, response: Any) -> None:
-        """Stop a task, and remove it if it is cleared."""
-        task, clear = self.task(request), type(response).__name__.startswith("Clear")
-        if clear:
-            self._tasks.pop(task.name, None)
-        task.stop(clear=clear)
-
-    @call("StartTask")
-    def start_task(self, request: Any, *_: Any) -> None:
-        """Start a task."""
-        self.task(request).start()
-
-    @call("TaskControl")
-    def control_task(self, request: Any, *_: Any) -> None:
-        """Start, stop or verify a task; the other states have no effect."""
-        task, action = self.task(request), constants.TaskMode(request.action_raw)
-        if action is constants.TaskMode.TASK_START:
+    @call("(Start|Stop|Clear)Task|TaskControl")
+    def control_task(self, request: Any, _: Any, __: Any, action: str | None) -> None:
+        """Start, stop, clear or verify a task; the other states have no effect."""
+        task = self.task(request)
+        action = action or constants.TaskMode(request.action_raw).name.removeprefix("TASK_").title()
+        if action == "Start":
             task.start()
-        elif action in (constants.TaskMode.TASK_STOP, constants.TaskMode.TASK_ABORT):
-            task.stop()
+        elif action in ("Stop", "Abort", "Clear"):
+            if action == "Clear":
+                self._tasks.pop(task.name, None)
+            task.stop(clear=action == "Clear")
         else:
             task.plan()
 
@@ -153,16 +149,15 @@ class Sessions(Calls):
         task = self.task(request)
         if task.kind is ChannelType.ANALOG_OUTPUT or (task.kind, kind) == (ChannelType.DIGITAL_OUTPUT, "Implicit"):
             refuse_value("SAMP_TIMING_TYPE", "on demand for outputs, or a sample clock for lines", kind)
+        types = {"Implicit": constants.SampleTimingType.IMPLICIT, "SampClk": constants.SampleTimingType.SAMPLE_CLOCK}
+        task.set("SAMP_TIMING_TYPE", types[kind].value)
         task.set("SAMP_QUANT_SAMP_MODE", request.sample_mode_raw)
         task.set("SAMP_QUANT_SAMP_PER_CHAN", request.samps_per_chan)
-        if kind == "Implicit":
-            return task.set("SAMP_TIMING_TYPE", constants.SampleTimingType.IMPLICIT.value)
-        task.set("SAMP_TIMING_TYPE", constants.SampleTimingType.SAMPLE_CLOCK.value)
-        task.set("SAMP_CLK_RATE", request.rate)
-        task.set("SAMP_CLK_SRC", request.source)
-        task.set("SAMP_CLK_ACTIVE_EDGE", request.active_edge_raw)
-        task.check_clock()
-        return None
+        if kind == "SampClk":
+            task.set("SAMP_CLK_RATE", request.rate)
+            task.set("SAMP_CLK_SRC", request.source)
+            task.set("SAMP_CLK_ACTIVE_EDGE", request.active_edge_raw)
+            task.check_clock()
 
     @call("Cfg(Dig|Anlg)Edge(Start|Ref)Trig")
     def configure_trigger(self, request: Any, _: Any, __: Any, kind: str, which: str) -> None:
@@ -206,13 +201,13 @@ class Sessions(Calls):
             }  # fmt: skip
             settable = _get_limits("AI", request) | {"CHAN_DESCR": row.label}
             kind = ChannelType.ANALOG_INPUT
-            channels.append(VirtualChannel(name, [each], kind, gain, offset, settable, fixed))
+            channels.append(VirtualChannel(name, [each], kind, gain * row.lsb_v, offset, settable, fixed))
         self.task(request).add(channels)
 
-    @call("|".join(counters.CALLS))
+    @call("|".join(scaling.COUNTER_CALLS))
     def add_counter(self, request: Any, _: Any, response: Any) -> None:
         """Create the counter input channel."""
-        usage, edge = counters.CALLS[type(response).__name__.removesuffix("Response")]
+        usage, edge = scaling.COUNTER_CALLS[type(response).__name__.removesuffix("Response")]
         physical = self._device.expand(request.counter, self._device.counters)
         prefix = re.sub(r"_(ACTIVE|START|STARTING)_EDGE$", "", edge)
         settable = {
@@ -247,15 +242,13 @@ class Sessions(Calls):
         if which == "O":
             self._outputs.check()
             kind, known = ChannelType.DIGITAL_OUTPUT, self._device.lines
-        lines, name = self._device.expand_lines(request.lines, known), request.name_to_assign_to_lines
+        lines, name = self._device.expand(request.lines, known), request.name_to_assign_to_lines
         names = unflatten_channel_string(request.lines)
         groups = [(name or (f"{names[0]}..." if len(names) > 1 else request.lines), lines)]  # the driver's name
         if request.line_grouping_raw == constants.LineGrouping.CHAN_PER_LINE.value:
             groups = [(each, [line]) for each, line in _name_channels(name, lines)]
-        numbers = [{f"D{which}_NUM_LINES": len(group)} for _, group in groups]
-        self.task(request).add(
-            [VirtualChannel(*group, kind, fixed=fixed) for group, fixed in zip(groups, numbers, strict=True)]
-        )
+        count = f"D{which}_NUM_LINES"
+        self.task(request).add([VirtualChannel(*group, kind, fixed={count: len(group[1])}) for group in groups])
 
 
 def _get_limits(prefix: str, request: Any) -> dict[str, Any]:

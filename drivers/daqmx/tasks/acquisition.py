@@ -30,11 +30,11 @@ class Trigger:
     level: float
     rising: bool
 
-    def find(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Return the rows at which the level is crossed, of successive counts."""
-        if self.rising:
-            return np.flatnonzero((before < self.level) & (after >= self.level))
-        return np.flatnonzero((before > self.level) & (after <= self.level))
+    def find(self, before: np.ndarray, samples: Samples) -> np.ndarray:
+        """Return the rows at which the level is crossed, from samples and the counts before each."""
+        column, sign = samples.names.index(self.channel), 1 if self.rising else -1
+        last, new = (sign * (counts[:, column] - self.level) for counts in (before, samples.values))
+        return np.flatnonzero((last < 0) & (new >= 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,42 +122,33 @@ class Acquisition(Daq):
         row = 0
         while row < len(samples) and not self.complete and self.failure is None:
             if self._armed and plan.start is not None:
-                edges = self._find_edges(plan.start, before, samples, row)
+                edges = plan.start.find(before[row:], samples.rows(row, len(samples)))
                 if not len(edges):
                     break
-                row, self._armed, self._phase = int(edges[0]), False, 0
+                row, self._armed, self._phase = row + int(edges[0]), False, 0
             row += self._take_piece(samples.rows(row, len(samples)), before[row:])
         if self.done or self._armed or self._pending is not None or plan.newest_only or plan.measure is not None:
             # Nothing of this is unread, so a rig that waits for its readers may continue.
             self._source.report_position(samples.index + len(samples), room=self._room, lost=0)
 
-    def _find_edges(self, trigger: Trigger, before: np.ndarray, samples: Samples, row: int = 0) -> np.ndarray:
-        column = samples.names.index(trigger.channel)
-        edges = trigger.find(before[:, column], samples.values[:, column])
-        return edges[edges >= row]
-
     def _take_piece(self, piece: Samples, before: np.ndarray) -> int:
         """Acquire from rows after the start trigger; return the number of rows used."""
         plan = self._plan
         values = piece.values[:, : plan.columns] if plan.measure is None else plan.measure.feed(piece)
-        step = 1 if plan.measure is not None and not plan.measure.clocked else plan.step
-        rows = np.arange(self._phase, len(values), step)
-        if step > 1:
-            self._phase = (self._phase - len(values)) % step
+        rows, first = np.arange(self._phase, len(values), plan.step), self._phase
+        self._phase = (self._phase - len(values)) % plan.step
         samples = replace(
             piece,
-            tick=row_tick(
-                piece.tick, piece.rate_hz, piece.tick_rate_hz, self._phase if not len(rows) else int(rows[0])
-            ),
-            rate_hz=piece.rate_hz / step,
+            tick=row_tick(piece.tick, piece.rate_hz, piece.tick_rate_hz, first),
+            rate_hz=piece.rate_hz / plan.step,
             names=piece.names[: plan.columns],
             units=piece.units[: plan.columns],
             values=values[rows],
             gap=0,
         )
         if self._pending is not None and plan.reference is not None:
-            edges = self._find_edges(plan.reference, before, piece)
-            if (samples := self._hold(samples, np.searchsorted(rows, edges))) is None:
+            edges = np.searchsorted(rows, plan.reference.find(before, piece))
+            if (samples := self._hold(samples, edges)) is None:
                 return len(piece)
         used = len(piece)
         if self._remaining is not None and len(samples) >= self._remaining:

@@ -6,15 +6,7 @@ import threading
 from dataclasses import dataclass, field
 from typing import Any
 
-from nidaqmx.constants import (
-    AcquisitionType,
-    ChannelType,
-    CountDirection,
-    Edge,
-    SampleTimingType,
-    TriggerType,
-    UsageTypeCI,
-)
+from nidaqmx import constants as c
 from nidaqmx.utils import unflatten_channel_string
 
 from drivers.daqmx.hardware.device import Device, Terminal
@@ -38,14 +30,14 @@ class VirtualChannel:
         name: Name.
         physical: Physical channels: one, or the lines of a digital channel.
         kind: Kind.
-        gain: Unit of the measurement per volt.
-        offset: Value at 0 V.
+        gain: Unit of the measurement per count.
+        offset: Value at count 0.
         attributes: Properties by name; those in `fixed` cannot be set.
     """
 
     name: str
     physical: list[str]
-    kind: ChannelType
+    kind: c.ChannelType
     gain: float = 1.0
     offset: float = 0.0
     attributes: dict[str, Any] = field(default_factory=dict)
@@ -69,7 +61,7 @@ class Configuration:
         """Notified at each start and stop; its lock is held while the task changes."""
 
     @property
-    def kind(self) -> ChannelType:
+    def kind(self) -> c.ChannelType:
         """Kind of the channels.
 
         Raises:
@@ -82,7 +74,7 @@ class Configuration:
     @property
     def clocked(self) -> bool:
         """True if the task has a sample clock."""
-        return bool(self.settings["SAMP_TIMING_TYPE"] == SampleTimingType.SAMPLE_CLOCK.value)
+        return bool(self.settings["SAMP_TIMING_TYPE"] == c.SampleTimingType.SAMPLE_CLOCK.value)
 
     def add(self, channels: list[VirtualChannel]) -> None:
         """Add channels.
@@ -99,7 +91,7 @@ class Configuration:
                     raise DaqmxError(Code.CHAN_ALREADY_IN_TASK, channel.name)
                 if set(channel.physical) & {name for other in self.channels for name in other.physical}:
                     raise DaqmxError(Code.DUPLICATE_PHYSICAL_CHANS_NOT_SUPPORTED, ", ".join(channel.physical))
-                if channel.kind is ChannelType.COUNTER_INPUT and self.channels:
+                if channel.kind is c.ChannelType.COUNTER_INPUT and self.channels:
                     raise DaqmxError(Code.MULTIPLE_COUNTER_INPUT_TASK, "the device has one counter")
                 self.channels.append(channel)
 
@@ -150,19 +142,17 @@ class Configuration:
         rate_hz = float(min(rows[name].rate_hz for name in names))
         measure = self._make_counter()
         timing, mode = settings["SAMP_TIMING_TYPE"], settings["SAMP_QUANT_SAMP_MODE"]
-        if timing == SampleTimingType.ON_DEMAND.value:
+        if timing == c.SampleTimingType.ON_DEMAND.value:
             if any(triggers.values()):
                 raise DaqmxError(Code.TRIG_WHEN_ON_DEMAND_SAMP_TIMING, "give the task a sample clock")
             return names, rate_hz, Plan(columns, newest_only=True, measure=measure)
-        step, wanted_hz = 1, rate_hz
-        if timing == SampleTimingType.SAMPLE_CLOCK.value:
-            step, wanted_hz = self.check_clock(rate_hz), settings["SAMP_CLK_RATE"]
-        elif measure is None or measure.clocked:
-            refuse_value("SAMP_TIMING_TYPE", "a sample clock for this measurement", timing)
-        if measure is not None and not measure.clocked and timing == SampleTimingType.SAMPLE_CLOCK.value:
-            refuse_value("SAMP_TIMING_TYPE", "implicit for this measurement", timing)
-        finite, size = mode == AcquisitionType.FINITE.value, settings["SAMP_QUANT_SAMP_PER_CHAN"]
-        if mode not in (AcquisitionType.FINITE.value, AcquisitionType.CONTINUOUS.value):
+        clocked = measure is None or measure.clocked
+        if timing != (c.SampleTimingType.SAMPLE_CLOCK if clocked else c.SampleTimingType.IMPLICIT).value:
+            must = "a sample clock" if clocked else "implicit"
+            refuse_value("SAMP_TIMING_TYPE", f"{must} for this measurement", timing)
+        step, wanted_hz = (self.check_clock(rate_hz), settings["SAMP_CLK_RATE"]) if clocked else (1, rate_hz)
+        finite, size = mode == c.AcquisitionType.FINITE.value, settings["SAMP_QUANT_SAMP_PER_CHAN"]
+        if mode not in (c.AcquisitionType.FINITE.value, c.AcquisitionType.CONTINUOUS.value):
             refuse_value("SAMP_QUANT_SAMP_MODE", "finite or continuous", mode)
         retrigger = settings["START_TRIG_RETRIGGERABLE"] and finite and triggers["START"] is not None
         endless = retrigger or not finite
@@ -199,11 +189,11 @@ class Configuration:
 
     def _find_columns(self) -> list[str]:
         """Return the channels of the table that the task reads."""
-        if self.kind is ChannelType.ANALOG_INPUT:
+        if self.kind is c.ChannelType.ANALOG_INPUT:
             return [self.device.channels[channel.physical[0]] for channel in self.channels]
-        if self.kind is ChannelType.COUNTER_INPUT:
+        if self.kind is c.ChannelType.COUNTER_INPUT:
             return [self._find_signal().channel]
-        if self.kind in (ChannelType.DIGITAL_INPUT, ChannelType.DIGITAL_OUTPUT):
+        if self.kind in (c.ChannelType.DIGITAL_INPUT, c.ChannelType.DIGITAL_OUTPUT):
             lines = [line for channel in self.channels for line in channel.physical]
             found = [self.device.inputs[line].channel for line in lines if line in self.device.inputs]
             return list(dict.fromkeys(found or list(self.device.channels.values())[: self.clocked]))
@@ -214,41 +204,41 @@ class Configuration:
         return self.device.find_terminal(next(v for key, v in channel.attributes.items() if key.endswith("_TERM")))
 
     def _make_counter(self) -> Counter | None:
-        if self.kind is not ChannelType.COUNTER_INPUT:
+        if self.kind is not c.ChannelType.COUNTER_INPUT:
             return None
         values, terminal = self.channels[0].attributes, self._find_signal()
-        usage = UsageTypeCI(self.channels[0].fixed["CI_MEAS_TYPE"])
+        usage = c.UsageTypeCI(self.channels[0].fixed["CI_MEAS_TYPE"])
         return Counter(
             usage, self.device.table.channels[terminal.channel], terminal,
-            rising=next(value for key, value in values.items() if key.endswith("_EDGE")) == Edge.RISING.value,
+            rising=next(value for key, value in values.items() if key.endswith("_EDGE")) == c.Edge.RISING.value,
             count=values.get("CI_COUNT_EDGES_INITIAL_CNT", 0),
-            up=values.get("CI_COUNT_EDGES_DIR") != CountDirection.COUNT_DOWN.value,
+            up=values.get("CI_COUNT_EDGES_DIR") != c.CountDirection.COUNT_DOWN.value,
         )  # fmt: skip
 
     def _find_trigger(self, which: str) -> Trigger | None:
         """Return the trigger START or REF of the settings, in counts."""
         kind = self.settings[f"{which}_TRIG_TYPE"]
-        if kind == TriggerType.NONE.value:
+        if kind == c.TriggerType.NONE.value:
             return None
-        if kind == TriggerType.DIGITAL_EDGE.value:
+        if kind == c.TriggerType.DIGITAL_EDGE.value:
             terminal = self.device.find_terminal(self.settings[f"DIG_EDGE_{which}_TRIG_SRC"])
             row = self.device.table.channels[terminal.channel]
             level, gain = (terminal.level - row.offset) / row.scale, row.scale
-            rising = self.settings[f"DIG_EDGE_{which}_TRIG_EDGE"] == Edge.RISING.value
-        elif kind == TriggerType.ANALOG_EDGE.value:
-            row, scale, offset = self._find_analog_source(self.settings[f"ANLG_EDGE_{which}_TRIG_SRC"])
-            gain = scale * row.lsb_v
+            rising = self.settings[f"DIG_EDGE_{which}_TRIG_EDGE"] == c.Edge.RISING.value
+        elif kind == c.TriggerType.ANALOG_EDGE.value:
+            row, gain, offset = self._find_analog_source(self.settings[f"ANLG_EDGE_{which}_TRIG_SRC"])
             level = (self.settings[f"ANLG_EDGE_{which}_TRIG_LVL"] - offset) / gain
-            rising = self.settings[f"ANLG_EDGE_{which}_TRIG_SLOPE"] == Edge.RISING.value
+            rising = self.settings[f"ANLG_EDGE_{which}_TRIG_SLOPE"] == c.Edge.RISING.value
         else:
             refuse_value(f"{which}_TRIG_TYPE", "a digital or an analog edge", kind)
         return Trigger(row.name, level, rising == (gain > 0.0))
 
     def _find_analog_source(self, name: str) -> tuple[Channel, float, float]:
         for channel in self.channels:
-            if channel.name.lower() == name.lower() and channel.kind is ChannelType.ANALOG_INPUT:
+            if channel.name.lower() == name.lower() and channel.kind is c.ChannelType.ANALOG_INPUT:
                 return self.device.channel(channel.physical[0]), channel.gain, channel.offset
-        return self.device.channel(self.device.expand(name, self.device.channels)[0]), 1.0, 0.0
+        row = self.device.channel(self.device.expand(name, self.device.channels)[0])
+        return row, row.lsb_v, 0.0
 
     def _check_stopped(self) -> None:
         if self.started:

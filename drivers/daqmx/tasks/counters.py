@@ -12,14 +12,6 @@ from drivers.sources.samples import Samples
 from rig.channels.orbit import find_edges
 from rig.channels.table import Channel
 
-CALLS = {
-    "CreateCICountEdgesChan": (UsageTypeCI.COUNT_EDGES, "CI_COUNT_EDGES_ACTIVE_EDGE"),
-    "CreateCIFreqChan": (UsageTypeCI.FREQUENCY, "CI_FREQ_STARTING_EDGE"),
-    "CreateCIPeriodChan": (UsageTypeCI.PERIOD, "CI_PERIOD_STARTING_EDGE"),
-    "CreateCIPulseChanFreq": (UsageTypeCI.PULSE_FREQ, "CI_PULSE_FREQ_START_EDGE"),
-    "CreateCIPulseChanTime": (UsageTypeCI.PULSE_TIME, "CI_PULSE_TIME_START_EDGE"),
-}
-"""Measurement and property of the first edge, by the call that creates a channel."""
 _TURNAROUND = 1 << 32
 """Number of values of a counter of 32 bits."""
 

@@ -8,11 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from nidaqmx.constants import (
-    AcquisitionType,
-    ChannelType,
-    SampleTimingType,
-)
+from nidaqmx.constants import AcquisitionType, ChannelType, SampleTimingType
 
 from drivers.daqmx.hardware.device import Device
 from drivers.daqmx.hardware.errors import Code, DaqmxError
@@ -141,11 +137,6 @@ class Task(Configuration):
         """Measurement of a counter, once the task runs."""
         return self._plan.measure if self.started else None
 
-    @property
-    def reads_newest(self) -> bool:
-        """True if the task runs on demand."""
-        return self._plan.newest_only
-
     def read(self, count: int, timeout_s: float, active: Callable[[], bool]) -> tuple[Samples, int]:
         """Return the next samples, and 0 or the code of the error that made them fewer than wanted.
 
@@ -206,18 +197,12 @@ class Task(Configuration):
                 if not active():
                     raise DaqmxError(Code.OPERATION_ABORTED, "the program no longer waits") from None
                 if deadline.passed:
-                    return self._read_available(acquisition), int(Code.SAMPLES_NOT_YET_AVAILABLE)
+                    return next(acquisition.ready(), self._no_samples()), int(Code.SAMPLES_NOT_YET_AVAILABLE)
             except StreamEndedError as error:
                 closed = self.acquisition is not acquisition
                 raise DaqmxError(
                     Code.OPERATION_ABORTED if closed else Code.DEV_CANNOT_BE_ACCESSED, str(error)
                 ) from None
-
-    def _read_available(self, acquisition: Acquisition) -> Samples:
-        try:
-            return acquisition.read(ALL_AVAILABLE, timeout_s=0.0, whole=False)
-        except LinkTimeoutError:
-            return self._no_samples()
 
     def _no_samples(self) -> Samples:
         width = self._plan.columns
