@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated
 
@@ -81,7 +81,8 @@ def _serve(listen: str, settings: dict[str, float], connection: Connection, *, a
         )
         while not stopped.is_set():
             try:
-                with connection.client() as client:
+                # Not for --wait-s: a wait inside zenoh would delay the end by Ctrl-C.
+                with replace(connection, wait_s=0.0).client() as client:
                     gateway.follow(client, publish, stopped, start)
             except (InputError, OSError, EOFError) as error:
                 if str(error) != last:
