@@ -443,7 +443,7 @@ class ServerDoor(Door):
 
     @contextmanager
     def serve(self, *options: str) -> Iterator[tuple[subprocess.Popen[str], Any]]:
-        arguments = ("--listen", "127.0.0.1:0", "--connect", self.endpoint, "--wait-s", f"{PATIENCE_S:g}", *options)
+        arguments = ("--listen", "127.0.0.1:0", "--connect", self.endpoint, "--wait-s", "600", *options)
         with processes.start_rig(self.name, *arguments, stderr=subprocess.STDOUT) as server:
             yield server, lambda: self.find_port(server)
             server.send_signal(signal.SIGINT)

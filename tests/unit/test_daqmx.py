@@ -6,6 +6,7 @@ import contextlib
 import re
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from typing import Any
 
@@ -16,7 +17,7 @@ import pytest
 from nidaqmx import GrpcSessionOptions
 from nidaqmx._stubs import nidaqmx_pb2  # noqa: PLC2701
 from nidaqmx._stubs.nidaqmx_pb2_grpc import NiDAQmxStub  # noqa: PLC2701
-from nidaqmx.constants import AccelUnits, AcquisitionType, Edge, LineGrouping, Slope
+from nidaqmx.constants import AccelUnits, AcquisitionType, Edge, LineGrouping, OverwriteMode, Slope
 from nidaqmx.error_codes import DAQmxErrors
 from nidaqmx.stream_readers import (
     AnalogMultiChannelReader,
@@ -395,6 +396,32 @@ def test_calls_of_another_program_during_a_read_end_it(
     assert not [thread for thread in threading.enumerate() if thread.name == "daq reports"]
 
 
+def test_a_reset_by_another_program_ends_reads_and_loses_no_samples_silently(
+    rig: PlayedRig, analog: Callable[..., nidaqmx.Task], options: GrpcSessionOptions
+) -> None:
+    task = analog("rig/ai0")
+    rig.send(0)
+    assert len(task.read(10)) == 10
+    System.remote(options).devices["rig"].reset_device()
+    for _ in range(2):
+        with pytest.raises(nidaqmx.DaqError, match="the device was reset; start the task again"):
+            task.read(10)
+    task.start()
+    rig.send(1)
+    assert len(task.read(10)) == 10
+
+
+def test_a_stop_in_another_thread_ends_a_read(task: nidaqmx.Task) -> None:
+    task.ai_channels.add_ai_voltage_chan("rig/ai0")
+    task.timing.cfg_samp_clk_timing(20_000.0, sample_mode=AcquisitionType.CONTINUOUS)
+    task.start()
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit(task.read, 10)
+        while not read.done():
+            task.stop()
+    assert "Operation aborted: the task was stopped" in str(read.exception())
+
+
 def test_clocked_lines_of_outputs_wait_for_the_clock(rig: PlayedRig, task: nidaqmx.Task) -> None:
     task.di_channels.add_di_chan("rig/port0", line_grouping=LineGrouping.CHAN_FOR_ALL_LINES)
     task.timing.cfg_samp_clk_timing(20_000.0, samps_per_chan=ROWS)
@@ -530,6 +557,8 @@ def test_wrong_settings_are_refused_with_the_codes_of_the_vendor(
             task.timing.cfg_samp_clk_timing(rate_hz)
     with refused(DAQmxErrors.INVALID_ROUTING_SOURCE_TERMINAL_NAME_ROUTING):
         task.triggers.start_trigger.cfg_dig_edge_start_trig("/rig/PFI3")
+    with pytest.raises(nidaqmx.DaqError, match="must be DO_NOT_OVERWRITE_UNREAD_SAMPLES; received OVERWRITE_UNREAD"):
+        task.in_stream.overwrite = OverwriteMode.OVERWRITE_UNREAD_SAMPLES
     with refused(DAQmxErrors.ATTRIBUTE_NOT_SUPPORTED_IN_TASK_CONTEXT):
         task.in_stream.overcurrent_chans_exist  # noqa: B018
     with refused(DAQmxErrors.INVALID_RANGE_OF_OBJECTS_SYNTAX_IN_STRING):

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from enum import EnumMeta
 from typing import NoReturn
 
+from nidaqmx import constants
 from nidaqmx.error_codes import DAQmxErrors
 
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 
 Code = DAQmxErrors
+_NAMES = {
+    item.value: Words(item.name) for kind in vars(constants).values() if isinstance(kind, EnumMeta)
+    for item in kind if item.value >= 10_000
+}  # fmt: skip
+"""Name of each value of the package's constants; smaller values have several meanings."""
 
 
 class DaqmxError(Exception):
@@ -27,6 +34,11 @@ class DaqmxError(Exception):
 def describe(code: int) -> str:
     """Return the text of a code: its name in the table of the package, in words; empty if it has none."""
     return DAQmxErrors(code).name.replace("_", " ").capitalize() if code in list(DAQmxErrors) else ""
+
+
+def name_constant(value: object) -> object:
+    """Return the name of a value of the package's constants, or the value if it has no name."""
+    return _NAMES.get(value, value)
 
 
 def refuse_value(what: str, must: str, received: object) -> NoReturn:

@@ -6,7 +6,7 @@ from typing import Any
 
 from nidaqmx import constants as c
 
-from drivers.daqmx.hardware.errors import refuse_value
+from drivers.daqmx.hardware.errors import name_constant, refuse_value
 from rig.channels.table import Channel
 
 _GRAVITY, _POUND, _INCH, _MIL = 9.80665, 4.4482216152605, 25.4e-3, 25.4e-6
@@ -85,7 +85,7 @@ def get_scale(request: Any, channel: Channel) -> tuple[float, float]:
 def _get_size(sizes: dict[Any, float], request: Any, field: str) -> float:
     found = {unit.value: size for unit, size in sizes.items()}
     if (number := getattr(request, f"{field}_raw")) not in found:
-        refuse_value(field, "units that the device supports", number)
+        refuse_value(field, "supported by the device", name_constant(number))
     return found[number]
 
 

@@ -15,7 +15,7 @@ from nidaqmx.utils import unflatten_channel_string
 
 from drivers.daqmx.hardware import scaling
 from drivers.daqmx.hardware.device import Device
-from drivers.daqmx.hardware.errors import Code, DaqmxError, describe, refuse_value
+from drivers.daqmx.hardware.errors import Code, DaqmxError, describe, name_constant, refuse_value
 from drivers.daqmx.hardware.outputs import Outputs
 from drivers.daqmx.rpc.calls import Calls, call
 from drivers.daqmx.tasks.configuration import VirtualChannel
@@ -53,10 +53,10 @@ class Sessions(Calls):
         self._numbers = itertools.count()
         self.bind()
 
-    def close(self, *, clear: bool = True) -> None:
+    def close(self) -> None:
         """Stop all tasks; they cannot be started again."""
         for task in list(self._tasks.values()):
-            task.stop(clear=clear)
+            task.stop(clear=True)
 
     def check(self, call: str, request: Any, context: Any) -> None:
         """Check the texts of a request, and its secret if it is for outputs, whose tasks all programs can name."""
@@ -139,7 +139,8 @@ class Sessions(Calls):
         """Stop all tasks; a self-test has no effect."""
         self._device.check_name(request.device_name)
         if action == "Reset":
-            self.close(clear=False)
+            for task in list(self._tasks.values()):
+                task.stop(abort=True)
 
     # ---- timing and triggers ----
 
@@ -220,7 +221,7 @@ class Sessions(Calls):
             settable["CI_COUNT_EDGES_DIR"] = request.count_direction_raw
         else:
             if request.units_raw not in (constants.FrequencyUnits.HZ.value, constants.TimeUnits.SECONDS.value):
-                refuse_value("units", "Hz or seconds", request.units_raw)
+                refuse_value("units", "Hz or seconds", name_constant(request.units_raw))
             settable |= _get_limits("CI", request)
             fixed[f"{prefix}_UNITS"] = request.units_raw
         name, kind = request.name_to_assign_to_channel or physical[0], ChannelType.COUNTER_INPUT

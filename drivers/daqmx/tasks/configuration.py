@@ -10,7 +10,7 @@ from nidaqmx import constants as c
 from nidaqmx.utils import unflatten_channel_string
 
 from drivers.daqmx.hardware.device import Device, Terminal
-from drivers.daqmx.hardware.errors import Code, DaqmxError, refuse_value
+from drivers.daqmx.hardware.errors import Code, DaqmxError, name_constant, refuse_value
 from drivers.daqmx.tasks.acquisition import Plan, Trigger
 from drivers.daqmx.tasks.counters import Counter
 from drivers.daqmx.tasks.settings import DEFAULTS, FIXED, get_buffer_size
@@ -119,7 +119,7 @@ class Configuration:
         if name not in DEFAULTS:
             raise DaqmxError(Code.ATTRIBUTE_NOT_SUPPORTED_IN_TASK_CONTEXT, f"{name} cannot be set")
         if name in FIXED and value != DEFAULTS[name]:
-            refuse_value(name, f"{DEFAULTS[name]}", value)
+            refuse_value(name, f"{name_constant(DEFAULTS[name])}", name_constant(value))
         with self.changed:
             self._check_stopped()
             self.settings[name] = value
@@ -149,11 +149,11 @@ class Configuration:
         clocked = measure is None or measure.clocked
         if timing != (c.SampleTimingType.SAMPLE_CLOCK if clocked else c.SampleTimingType.IMPLICIT).value:
             must = "a sample clock" if clocked else "implicit"
-            refuse_value("SAMP_TIMING_TYPE", f"{must} for this measurement", timing)
+            refuse_value("SAMP_TIMING_TYPE", f"{must} for this measurement", name_constant(timing))
         step, wanted_hz = (self.check_clock(rate_hz), settings["SAMP_CLK_RATE"]) if clocked else (1, rate_hz)
         finite, size = mode == c.AcquisitionType.FINITE.value, settings["SAMP_QUANT_SAMP_PER_CHAN"]
         if mode not in (c.AcquisitionType.FINITE.value, c.AcquisitionType.CONTINUOUS.value):
-            refuse_value("SAMP_QUANT_SAMP_MODE", "finite or continuous", mode)
+            refuse_value("SAMP_QUANT_SAMP_MODE", "finite or continuous", name_constant(mode))
         retrigger = settings["START_TRIG_RETRIGGERABLE"] and finite and triggers["START"] is not None
         endless = retrigger or not finite
         buffer = settings["INPUT_BUF_SIZE"] or (get_buffer_size(wanted_hz, size) if endless else size)
@@ -230,7 +230,7 @@ class Configuration:
             level = (self.settings[f"ANLG_EDGE_{which}_TRIG_LVL"] - offset) / gain
             rising = self.settings[f"ANLG_EDGE_{which}_TRIG_SLOPE"] == c.Edge.RISING.value
         else:
-            refuse_value(f"{which}_TRIG_TYPE", "a digital or an analog edge", kind)
+            refuse_value(f"{which}_TRIG_TYPE", "a digital or an analog edge", name_constant(kind))
         return Trigger(row.name, level, rising == (gain > 0.0))
 
     def _find_analog_source(self, name: str) -> tuple[Channel, float, float]:

@@ -43,7 +43,7 @@ class Task(Configuration):
         self.acquisition: Acquisition | None = None
         self.output: Callable[[range], None] | None = None
         """Writes the output samples of a range to the lines, for a task with a sample clock."""
-        self._cleared = False
+        self._cleared = self._aborted = False
         self._generator = threading.Thread()
         self._plan = Plan(0)
         self._open_source = open_source
@@ -72,13 +72,19 @@ class Task(Configuration):
                 if generates:
                     self._generator = threading.Thread(target=self._generate, args=(self.acquisition,), daemon=True)
                     self._generator.start()
-            self._plan, self.position, self.started = plan, 0, True
+            self._plan, self.position, self.started, self._aborted = plan, 0, True, False
             self.changed.notify_all()
 
-    def stop(self, *, clear: bool = False) -> None:
-        """Stop; unread samples are discarded. A cleared task cannot be started again, by a call in progress."""
+    def stop(self, *, clear: bool = False, abort: bool = False) -> None:
+        """Stop; unread samples are discarded.
+
+        Args:
+            clear: The task cannot be started again, by a call in progress.
+            abort: A read that follows is an error and does not start the task, unless its program stops or starts it.
+        """
         with self.changed:
             self._cleared |= clear
+            self._aborted = abort and (self.started or self._aborted)
             acquisition, self.acquisition, self.started, self.position = self.acquisition, None, False, 0
             self.changed.notify_all()
         if acquisition is not None:
@@ -156,6 +162,8 @@ class Task(Configuration):
         if automatic:
             if not self.settings["AUTO_START"]:
                 raise DaqmxError(Code.CANNOT_READ_WHEN_AUTO_START_FALSE_AND_TASK_NOT_RUNNING_OR_COMMITTED, "start it")
+            if self._aborted:
+                raise DaqmxError(Code.OPERATION_ABORTED, "the device was reset; start the task again")
             self.start()
         acquisition, plan = self.acquisition, self._plan
         if acquisition is None:
@@ -200,9 +208,9 @@ class Task(Configuration):
                     return next(acquisition.ready(), self._no_samples()), int(Code.SAMPLES_NOT_YET_AVAILABLE)
             except StreamEndedError as error:
                 closed = self.acquisition is not acquisition
-                raise DaqmxError(
-                    Code.OPERATION_ABORTED if closed else Code.DEV_CANNOT_BE_ACCESSED, str(error)
-                ) from None
+                if closed:
+                    raise DaqmxError(Code.OPERATION_ABORTED, "the task was stopped") from None
+                raise DaqmxError(Code.DEV_CANNOT_BE_ACCESSED, str(error)) from None
 
     def _no_samples(self) -> Samples:
         width = self._plan.columns
