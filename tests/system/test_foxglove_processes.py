@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import signal
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -17,13 +18,15 @@ pytestmark = pytest.mark.wallclock
 
 def read_port(child: subprocess.Popen[str]) -> int:
     assert child.stdout is not None
-    found = re.match(r"ws://127\.0\.0\.1:(\d+) serves", child.stdout.readline())
+    found = re.match(r"ws://127\.0\.0\.1:(\d+) serves \S+cut\.mcap;", child.stdout.readline())
     assert found is not None
     return int(found[1])
 
 
-def test_a_recording_is_played_by_the_play_bar() -> None:
-    with start_rig("foxglove", "--replay", "tests/recordings/hammer-table-1.mcap", "--listen", "127.0.0.1:0") as child:
+def test_a_recording_is_played_by_the_play_bar(tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(Path("tests/recordings/hammer-table-1.mcap").read_bytes()[:-50])
+    with start_rig("foxglove", "--replay", str(cut), "--listen", "127.0.0.1:0") as child:
         with FoxgloveClient(read_port(child)) as client:
             client.until(lambda: client.channels)
             topic = next(topic for topic in client.channels if topic != "view/events")
@@ -33,3 +36,4 @@ def test_a_recording_is_played_by_the_play_bar() -> None:
         child.send_signal(signal.SIGTERM)
         _, error = child.communicate(timeout=60.0)
         assert (child.returncode, "Traceback" in error) == (0, False), error
+        assert "rig: the recording was cut off" in error

@@ -260,6 +260,7 @@ def test_the_command_writes_a_layout_and_refuses_other_addresses(
         ("--view-rate-hz", "0"): "above 0",
         ("--layout", str(tmp_path / "a.txt")): "--layout must be",
         ("--replay", str(tmp_path / "none.mcap"), "--listen", "127.0.0.1:0"): "none.mcap",
+        ("--replay", "a.mcap", "--connect", "127.0.0.1:7461", "--listen", "127.0.0.1:0"): "--connect must be left out",
     }.items():
         status, error = run(*options)
         assert (status, error.count("\n")) == (2, 1), error

@@ -14,6 +14,7 @@ import typer
 
 from rig.base.errors import InputError, require_package
 from rig.base.files import check_new_file, write_file
+from rig.base.text import printable
 from rig.cli.connections.connection import Connection, SecretFile
 from rig.cli.options import Force
 from rig.cli.output.tables import echo
@@ -58,12 +59,15 @@ def foxglove(
     check_view_rate(view_rate_hz)
     if view_rate_hz == 0.0:
         raise InputError("--view-rate-hz", "above 0", view_rate_hz)
+    if replay is not None and connection.connect != Connection.connect:
+        raise InputError("--connect", "left out with --replay FILE", connection.connect)
     source = connection if replay is None else replace(connection, tls=None)
+    shown = f"the rig at {source.connect}" if replay is None else printable(str(replay))
     required = source.read_secret(secret, allow_commands=allow_commands)
     playback = replay is not None or (allow_commands and required is None)
     with nullcontext(source.connect) if replay is None else _replayed(replay) as endpoint:
         _serve(
-            replace(source, connect=endpoint), address, view_rate_hz,
+            replace(source, connect=endpoint), shown, address, view_rate_hz,
             allow_commands=allow_commands, allow_playback=playback, secret=required,
         )  # fmt: skip
 
@@ -79,8 +83,9 @@ def _write_layout(path: Path, recording: Path | None, *, force: bool) -> None:
 
 
 def _serve(
-    connection: Connection, address: tuple[str, int], view_rate_hz: float, *, secret: str | None, **access: bool
-) -> None:
+    connection: Connection, shown: str, address: tuple[str, int], view_rate_hz: float, *, secret: str | None,
+    **access: bool,
+) -> None:  # fmt: skip
     """Serve the rig at an address until a signal."""
     from drivers.console import Console
     from recorder.foxglove.server import FoxgloveServer
@@ -94,7 +99,7 @@ def _serve(
             ) as server,
             stop_on_signals(done.set),
         ):
-            echo(f"ws://127.0.0.1:{server.port} serves the rig at {connection.connect}; {server.app_url}")
+            echo(f"ws://127.0.0.1:{server.port} serves {shown}; {server.app_url}")
             if access["allow_commands"] and secret is None:
                 echo("rig: warning: every program and every page in a browser here can send commands", err=True)
             echo("rig: Ctrl-C ends it", err=True)
@@ -112,7 +117,10 @@ def _replayed(recording: Path) -> Iterator[str]:
     from rig.serve.transport.zenoh import ZenohServer
 
     with ZenohServer("127.0.0.1:0") as server:
-        player = Player(Track([recording]), server, RealTime(), paused=True, hold=True, linger_s=0.5)
+        track = Track([recording])
+        if not track.complete:
+            echo("rig: the recording was cut off; it is played up to that point", err=True)
+        player = Player(track, server, RealTime(), paused=True, hold=True, linger_s=0.5)
         player.prepare()
         playing = threading.Thread(target=player.run, name="player", daemon=True)
         playing.start()
