@@ -245,13 +245,15 @@ def lock_folder(folder: Path, what: str) -> int:
 
     Raises:
         DiskError: The folder cannot be created or opened.
-        InputError: Another process holds the lock.
+        InputError: It is a file, or another process holds the lock.
     """
     import fcntl
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(folder, os.O_RDONLY)
+    except FileExistsError:
+        raise InputError("--output", "a folder", Words(f"{folder}, which is a file")) from None
     except OSError as error:
         raise DiskError(f"{folder}: {error.strerror}") from None
     try:

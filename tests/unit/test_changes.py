@@ -149,6 +149,15 @@ def test_phase_that_is_too_short_is_reported(impact: Recording) -> None:
     assert result.outcome is Outcome.INCONCLUSIVE
 
 
+@pytest.mark.parametrize(("from_s", "to_s"), [(0.03, 0.3), (0.4, 1.2), (0.75, 1.5)])
+def test_another_stretch_of_the_same_signals_is_no_change(
+    run: Recording, tmp_path: Path, from_s: float, to_s: float
+) -> None:
+    """Unbalance and a free vibration of almost its frequency beat: the RMS differs between stretches."""
+    cut(join([run.path]), tmp_path / "part.mcap", from_s=from_s, to_s=to_s)
+    assert not compare(run, Recording.open(tmp_path / "part.mcap")).changed
+
+
 def test_rotation_and_decay_are_measured() -> None:
     times = np.arange(20_000) / 10_000.0
     noise = 1e-3 * np.random.default_rng(0).standard_normal(len(times))

@@ -327,6 +327,18 @@ def test_few_pulses_are_interpreted_by_the_name(
     assert "# commands = []" in text
 
 
+@pytest.mark.parametrize("unit", ["TTL", "counts", ""])
+def test_the_unit_of_a_keyphasor_does_not_stop_an_import(
+    unit: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, t = tmp_path / "x.csv", np.arange(3000) / 3000
+    columns = np.column_stack([t, foreign.make_keyphasor(t), foreign.hammer(t)])
+    np.savetxt(path, columns, delimiter=",", header=f"time [s],keyphasor [{unit}],hammer [N]", comments="", fmt="%.6f")
+    out = run_for_output(capsys, "import", path, "-o", tmp_path / "x.mcap", "--wide")
+    assert len(Recording.open(tmp_path / "x.mcap").edges()) > 2
+    assert ("not the unit" in out) == bool(unit)
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [

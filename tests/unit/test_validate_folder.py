@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -68,8 +69,25 @@ def test_table_is_the_same_after_two_interruptions(
     assert len(done) == 3, "with other options each file is validated again"
 
 
+def test_any_name_and_file_in_a_folder_is_a_row(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The table can be continued; an unreadable file is tried again, although its size and time are the same."""
+    data, late = (folder / "good.mcap").read_bytes(), tmp_path / "late.mcap"
+    (tmp_path / "sub.mcap").mkdir()
+    (tmp_path / "nowhere.mcap").symlink_to("missing.mcap")
+    (tmp_path / os.fsdecode(b"b\xff.mcap")).write_bytes(b"")
+    for content, outcome in ((bytes(len(data)), "not readable"), (data, "pass")):
+        late.write_bytes(content)
+        os.utime(late, ns=(0, 0))
+        code, out, _ = run_captured(capsys, "validate", str(tmp_path), "-o", str(tmp_path / "results"), "--json")
+        rows = {row["file"]: row["outcome"] for row in json.loads(out)["rows"]}
+        assert code == 3
+        assert rows == {"b\\xff.mcap": "not readable", "nowhere.mcap": "not readable", "late.mcap": outcome}
+
+
 def test_wrong_use_is_one_line(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one = str(folder / "good.mcap")
-    for arguments in ([str(tmp_path)], [str(folder), one], [one, "-o", str(tmp_path)]):
+    for arguments in ([str(tmp_path)], [str(folder), one], [one, "-o", str(tmp_path)], [str(folder), "-o", one]):
         code, _, error = run_captured(capsys, "validate", *arguments)
         assert (code, error.count("\n")) == (2, 1)

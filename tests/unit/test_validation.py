@@ -451,3 +451,6 @@ def test_a_budget_needs_a_log_and_a_known_suffix(hammer: Recording, capsys: pyte
     code, _, text = run_captured(capsys, "validate", str(hammer.path), "--budget", f"{out}.txt")
     assert (code, "ends in .html, .pdf or .md" in text) == (2, True), text
     assert not out.with_suffix(".md").exists()
+    both = ("--budget", f"{out}.html", "--report", f"{out.parent}/./{out.name}.html")
+    code, _, text = run_captured(capsys, "validate", str(hammer.path), *both)
+    assert (code, "--budget must be another file than --report" in text) == (2, True), text

@@ -70,7 +70,8 @@ class _Fit:
     """Fit of a constant and of tones to a steady signal, with other lines of its spectrum and their modulation.
 
     A line beyond the known tones, such as free vibration, is fitted with a slowly varying amplitude, so that it does
-    not count as noise.
+    not count as noise. The variation of the constant or of a known tone, such as the beat with a free vibration of
+    almost that frequency, is part of its variance: another stretch of the signal has another mean or amplitude.
     """
 
     def __init__(self, values: np.ndarray, tones: np.ndarray) -> None:
@@ -80,6 +81,7 @@ class _Fit:
         # Periods per record, angle [cycles] and highest degree of modulation of each tone; the constant comes first.
         lines = [(0.0, np.zeros(n), 0), *((abs(float(turn[-1] - turn[0])), turn, 0) for turn in tones.T)]
         matrix = np.column_stack([np.ones(n), *(wave for turn in tones.T for wave in _waves(turn))])
+        drifts: list[tuple[int, int, int]] = []  # column of a known line, column of its variation, degree
         while True:
             parts = solve_normal(matrix.T @ matrix, matrix.T @ values)
             residual = values - matrix @ parts
@@ -96,9 +98,15 @@ class _Fit:
                 lines.append((place, turn, 2))
             shapes = [np.polynomial.legendre.Legendre.basis(degree)(span) for degree in degrees]
             waves = _waves(turn) if turn.any() else (np.ones(n),)
+            if near and near[0] < known:
+                first = max(2 * near[0] - 1, 0)
+                places = [(first + k, degree) for degree in degrees for k in range(len(waves))]
+                drifts += [(of, matrix.shape[1] + k, degree) for k, (of, degree) in enumerate(places)]
             matrix = np.column_stack([matrix, *(shape * wave for shape in shapes for wave in waves)])
         self.parts = parts
         self.covariance, self.dof = sandwich(matrix, residual)
+        for of, column, degree in drifts:
+            self.covariance[of, of] += parts[column] ** 2 / (2 * degree + 1)
 
     def constant(self) -> Estimate:
         """Return the constant."""

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -87,6 +88,8 @@ def validate(
         check_report(report, force=force)
     if budget is not None:
         check_report(budget, force=force, field="--budget", suffixes=TEXT_SUFFIXES)
+        if report is not None and budget.resolve() == report.resolve():
+            raise InputError("--budget", "another file than --report", str(budget))
     rules = load_criteria(criteria)
     rules = rules.with_floating((*rules.floating, *split_names(floating, "--float")))
     texts = SceneChanges(changes=changes, engine=engine).overrides()
@@ -136,7 +139,7 @@ def _validate_folder(
     from rig.base.text import replace_nonfinite
     from rig.ensemble.ensemble import iterate_results, local_workers
 
-    files = sorted(folder.glob("*.mcap"))
+    files = sorted(file for file in folder.glob("*.mcap") if not file.is_dir())
     if not files:
         raise InputError("FILE", "a recording, or a folder with recordings (.mcap)", str(folder))
     settings = [options["criteria"].model_dump_json(), *map(repr, options.values()), versions(RIG), commit()]
@@ -144,23 +147,31 @@ def _validate_folder(
     try:
         code = hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
         journal = Journal(output, "validations.jsonl", code, fresh=force)
-        known = {(row["file"], row["stamp"]): row for row in journal.rows}
-        stamps = {file: f"{(status := file.stat()).st_size} {status.st_mtime_ns}" for file in files}
-        left = [k for k, file in enumerate(files) if (file.name, stamps[file]) not in known]
+        # A file that was not readable is tried again: its permissions or its link may have changed.
+        known = {(row["file"], row["stamp"]): row for row in journal.rows if row["outcome"] != _DAMAGED}
+        keys = [(os.fsencode(file.name).decode(errors="backslashreplace"), _stamp(file)) for file in files]
+        left = [k for k, key in enumerate(keys) if key not in known]
         with reporting(compiles=True) as reporter, local_workers(jobs) as workers:
             reporter.begin(len(files))
             reporter.done = len(files) - len(left)
             for k, row in iterate_results(workers, left, _validate_file, files, options):
-                row = replace_nonfinite({"file": files[k].name, "stamp": stamps[files[k]], **row, "code": code})
+                name, stamp = keys[k]
+                known[keys[k]] = row = replace_nonfinite({"file": name, "stamp": stamp, **row, "code": code})
                 journal.add(row)
-                known[row["file"], row["stamp"]] = row
                 reporter.step(f"{row['file']}: {row['outcome']}")
-        rows = [known[file.name, stamps[file]] for file in files]
+        rows = [known[key] for key in keys]
         rows.sort(key=lambda row: (_RANKS.index(row["outcome"]), -row["failures"], row["file"]))
         write_file(output / "validations.json", json.dumps({"folder": str(folder), "rows": rows}, indent=2) + "\n")
     finally:
         os.close(lock)
     return rows
+
+
+def _stamp(file: Path) -> str:
+    """Return size and time of a file; empty for one that vanished, or a link to nothing."""
+    with suppress(OSError):
+        return f"{(status := file.stat()).st_size} {status.st_mtime_ns}"
+    return ""
 
 
 _DAMAGED = "not readable"

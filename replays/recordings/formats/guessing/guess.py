@@ -439,6 +439,9 @@ def _scale(each: Guess, unit: str, usual_v: float) -> None:
         each.reasons.append("polarity: its preload is negative")
     text = f"{each.entry.name} {each.entry.label}"
     if unit == "1":
+        if not each.volts and units.get_quantity(each.own_unit) != "number":
+            each.unit = "1"
+            each.reasons.append(f"only the pulses are used, and not the unit {each.entry.unit!r}")
         return
     if each.volts:
         match = _SENSITIVITY.search(text)
