@@ -22,6 +22,7 @@ from rig.run.offline import frames
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
 from tests.commands import run_captured
+from tests.unit.test_validation import record_scene
 
 Counts = Callable[[np.ndarray], np.ndarray]
 
@@ -141,6 +142,23 @@ def test_missing_phase_is_inconclusive(impact: Recording, run: Recording, tmp_pa
     assert result.outcome is Outcome.INCONCLUSIVE
     assert any(line.startswith("only in A: phase impacts") for line in result.missing)
     assert compare(run, run).outcome is Outcome.PASS
+
+
+def test_phases_are_found_by_channels_that_both_recordings_have(impact: Recording, tmp_path: Path) -> None:
+    """A recording without probes of the ring and without transducers shows no contact."""
+    cut(join([impact.path]), tmp_path / "part.mcap", channels=("disk_x", "speed", "keyphasor"))
+    part = Recording.open(tmp_path / "part.mcap")
+    for pair in ((impact, part), (part, impact)):
+        result = compare(*pair)
+        assert result.outcome is Outcome.INCONCLUSIVE
+        assert {one.channel for one in result.changes} == {"disk_x", "speed"}
+
+
+def test_gaps_are_reported(impact: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gaps = record_scene(tmp_path / "gaps.mcap", duration_s=0.06, leave_out=(1, 3))
+    code, out, _ = run_captured(capsys, "compare", str(gaps.path), str(impact.path))
+    assert (code, "A has gaps: only the longest stretch without one is compared" in out) == (3, True)
+    assert "Changes, largest first" not in out
 
 
 def test_phase_that_is_too_short_is_reported(impact: Recording) -> None:

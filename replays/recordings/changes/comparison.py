@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -212,14 +212,17 @@ class _Log:
         except (KeyError, TypeError, ValueError):
             return math.nan
 
-    def find_phases(self, touches: float) -> None:
-        """Find the phases with a common distance of contact; they begin at the hammer pulse, if there is one."""
+    def find_phases(self, touches: float, common: Set[str]) -> None:
+        """Find the phases by common channels and distance of contact; they begin at the hammer pulse, if any."""
         self.touches = touches
         view = self.view(Phase("", self.begin_s, self.end_s), {})
         base = {name: float(np.median(view.values[name][:MIN_STEADY_ROWS])) for name in FORCES if name in view.values}
         self.base = base
         floor = math.hypot(*(self.noise.get(name, 0.0) for name in FORCES))
-        found = find_phases(self.view(Phase("", self.begin_s, self.end_s), base), floor_n=floor)
+        view = self.view(Phase("", self.begin_s, self.end_s), base)
+        for name in {*RING, *FORCES} - common:
+            view.values.pop(name, None)
+        found = find_phases(view, floor_n=floor)
         hit, count = self.hammer_s, Counter[str]()
         for one in found:
             pieces = [one]
@@ -372,12 +375,19 @@ def compare(first: Recording, second: Recording) -> Comparison:
     files = first.path.name, second.path.name
     if not any(logs[1].units.get(name) == unit for name, unit in logs[0].units.items()):
         raise InputError("recordings", "two with a channel of the same name and unit", f"{files[0]} and {files[1]}")
-    touches = max(log.clearance() for log in logs)
+    touches = float(np.fmax(logs[0].clearance(), logs[1].clearance()))
+    common = logs[0].units.keys() & logs[1].units.keys()
+    shows_contact = common.issuperset(RING) or common.issuperset(FORCES)
     for log in logs:
-        log.find_phases(touches)
+        if not shows_contact and None in (logs[0].hammer_s, logs[1].hammer_s):
+            log.hammer_s = None
+        log.find_phases(touches, common)
     both = [name for name in logs[0].phases if name in logs[1].phases]
     missing = _only("phase", *(dict.fromkeys(log.phases) for log in logs))
     missing += _only("channel", *({f"{name} [{unit}]": 0 for name, unit in log.units.items()} for log in logs))
+    for label, log in zip("AB", logs, strict=True):
+        if any((np.diff(part.index) != 1).any() for part in log.parts.values()):
+            missing += [f"{label} has gaps: only the longest stretch without one is compared"]
     pairs = {}
     for name in both:
         spans = [log.phases[name] for log in logs]

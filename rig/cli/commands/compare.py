@@ -72,6 +72,8 @@ def _show(result: Comparison, console: Console, *, wide: bool) -> None:
     table = new_table("Changes, largest first", *HEADINGS, spare=("A", "B"), keys=3)
     for one in shown:
         table.add_row(*one.cells)
+    if not shown:
+        return
     console.print()
     console.print(table)
     if len(shown) < len(result.changes):

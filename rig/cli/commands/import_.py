@@ -192,7 +192,7 @@ def _find_questions(text: str) -> list[str]:
             table = bare.partition("#")[0].strip()
         if CHECK in line:
             held, _, question = line.partition(f"# {CHECK}: ")
-            held = held.strip().removeprefix("# ")
+            held = held.strip().lstrip("# ")
             about = f"{table} {'' if held == table else held}".strip()
             questions.append(f"{about}: {question.partition(' (')[0]}")
     return questions
