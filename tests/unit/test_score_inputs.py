@@ -109,7 +109,7 @@ def test_no_channel_at_all_is_refused(
     daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts))
     status, _, err = run_captured(capsys, "score", daq, "--against", str(session), "--channels", channels)
     assert (status, err.count("\n")) == (2, 1), err
-    assert "--channels must be names of channels or groups" in err
+    assert "--channels must be one or more names, separated by commas" in err
 
 
 def test_an_unknown_channel_of_a_mapping_is_named_with_its_line(
