@@ -21,6 +21,7 @@ SIZES = {
     "velocity": {"m/s": 1.0, "mm/s": 1e-3, "um/s": 1e-6, "in/s": IN, "mil/s": 25.4e-6, "ft/s": 0.3048},
     "speed of rotation": {"Hz": 2 * math.pi, "rpm": math.pi / 30, "krpm": 100 * math.pi / 3, "deg/s": math.pi / 180},
     "angle": {"deg": math.pi / 180, "rev": 2 * math.pi, "mrad": 1e-3},
+    "energy": {"J": 1.0, "kJ": 1e3, "mJ": 1e-3},
     "torque": {"N m": 1.0, "kN m": 1e3, "mN m": 1e-3, "N mm": 1e-3, "lbf ft": 1.3558179483314004,
                "lbf in": 0.1129848290276167, "daN m": 10.0, "kgf m": G},
     "pressure": {"Pa": 1.0, "hPa": 100.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "bar": 1e5, "mbar": 100.0,

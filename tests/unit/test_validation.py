@@ -417,7 +417,11 @@ def test_floated_numbers_are_fitted_to_a_recording_of_the_rig_and_not_judged(
     assert code == 0
     assert abs(floated["value"] - 0.22) < floated["half_width"] < 1e-3
     code, _, text = run_captured(capsys, *arguments[:-2], "contact.frictoin")
-    assert (code, "contact.friction" in text, text.startswith("rig: --float must be of a parameter")) == (2, True, True)
+    assert (code, "contact.friction" in text, text.startswith("rig: --float must be the name of a parameter")) == (
+        2,
+        True,
+        True,
+    )
 
 
 def test_a_number_that_a_recording_does_not_determine_is_no_pass(tmp_path: Path) -> None:

@@ -310,8 +310,8 @@ def _check_key(experiment: Experiment, key: str) -> None:
         get_value(experiment, key)
         return
     close = find_similar(key, own)
-    must = "of a parameter, a number of the scene ("
-    must += f"{', '.join(_SCENE_KEYS)}) or of a command (hammer.1.force_n)"
+    must = f"the name of a parameter, of a number of the scene ({', '.join(_SCENE_KEYS)}) or of a command "
+    must += "(hammer.1.force_n)"
     if key in parameters or key.split(".")[0] in Scene.model_fields:
         must += ", which describe the rig or the experiment, not the simulation"
     elif close:
