@@ -23,13 +23,15 @@ from replays.recordings.identification.agreement import solve_weighted
 from replays.recordings.identification.log import identify_log
 from replays.recordings.identification.nuisance import Tuned, find_nuisances, tune
 from replays.recordings.resimulation.experiment import Experiment, is_imported
-from replays.recordings.resimulation.prediction import predict, read_measured
+from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured
 from replays.recordings.resimulation.sensitivity import ANGLE, PHASE, get_value, with_values
 from replays.recordings.validation import load_criteria, validate
 from replays.recordings.validation.explanations.budget import make_fit_budgets
 from replays.recordings.validation.explanations.channel_fit import Shown
+from replays.recordings.validation.explanations.faults import sensor_faults
 from replays.recordings.validation.explanations.signals import edge_faults
 from replays.recordings.validation.explanations.timing import filtered
+from replays.recordings.validation.trajectory import residuals
 from rig.base.errors import InputError
 from rig.base.outcome import Outcome
 from rig.channels.table import default_table
@@ -190,6 +192,18 @@ def test_another_kind_of_low_pass_than_told_is_named(kind: str) -> None:
     assert any(
         re.search(rf"of kind {kind} \d near (48|49|50)\d\d Hz, told butterworth of 5000 Hz", law) for law in laws
     ), laws
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3])
+def test_an_offset_below_the_noise_is_found_by_its_mean(offset: float) -> None:
+    """Over 2000 samples its mean is some 13 standard errors, although the RMS is within its limit."""
+    channel, times_s = default_table().channels["P_W"], np.arange(2000) / 20e3
+    values = offset + np.random.default_rng(1).standard_normal((2000, 1))
+    part = Measured("forces", (channel,), times_s, np.arange(2000), values, np.ones(1), np.array([True]), ideal=False)
+    (found,) = residuals({"forces": part}, {"forces": values}, load_criteria())
+    assert (found.good, found.rms < found.limit, found.drift > 10.0) == (not offset, True, bool(offset))
+    (fault,) = sensor_faults({"forces": part}, Prediction({"forces": 0.0 * values}, {}, 1), 9.0) or (None,)
+    assert (fault and fault.name) == ("P_W offset" if offset else None)
 
 
 def test_floated_friction_of_a_log_is_fitted_and_the_rest_is_judged_with_it(mils: Recording) -> None:

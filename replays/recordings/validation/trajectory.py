@@ -44,7 +44,7 @@ class ChannelResidual:
         n: Number of samples.
         rms: RMS of residual over floor; 1 is noise alone.
         peak: Largest residual over floor.
-        drift: Largest mean over a stretch, in standard errors of the mean.
+        drift: Largest mean over a stretch or over all samples, in standard errors of the mean.
         limit: Limit of `rms`, including its standard errors.
         peak_limit: Limit of `peak`.
         drift_limit: Limit of `drift`.
@@ -220,7 +220,7 @@ def residuals(
 def _judge(part: Measured, c: int, z: np.ndarray, criterion: TrajectoryCriterion | None) -> ChannelResidual:
     rms, peak = float(np.sqrt(np.mean(z**2))), float(np.abs(z).max())
     means = block_means(z, STRETCH) * math.sqrt(STRETCH)
-    drift = float(np.abs(means).max(initial=0.0))
+    drift = float(np.abs(means).max(initial=abs(z.mean()) * math.sqrt(len(z))))
     limit, good, first = math.inf, None, None
     peak_limit = drift_limit = math.inf
     if criterion is not None:

@@ -75,7 +75,7 @@ def sensor_faults(
 def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lambda _text: None) -> list[Explanation]:
     """Return the faults of pairs of channels, then of single ones, with equal faults of several channels merged."""
     total = sum(excess(one.apart) for one in shown)
-    off = {x.name: x for x in shown if x.counts is not None or (len(x.values) > MIN_ROWS and not is_noise(x.apart))}
+    off = {x.name: x for x in shown if x.counts is not None or (len(x.values) > MIN_ROWS and x.differs)}
     explain = _ExplanationMaker(total, end_s)
     faults, names = [], set()
     for a, b in combinations(off.values(), 2):
