@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.estimate.least_squares import solve
-from replays.recordings.validation.explanations.explanation import is_noise
 from rig.channels.faults.defects import DEFECTS, size_text, unit_of
 from rig.channels.table import Channel
 
@@ -88,11 +87,6 @@ class Shown:
     def apart(self) -> np.ndarray:
         """Residuals over the floor, shape (n,)."""
         return (self.values - self.expected) / self.floor
-
-    @property
-    def differs(self) -> bool:
-        """True if the residuals are not noise, or their mean is not."""
-        return not is_noise(self.apart) or abs(self.apart.sum()) > OUTLIER * math.sqrt(len(self.apart))
 
     @cached_property
     def price(self) -> float:

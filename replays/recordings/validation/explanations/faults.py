@@ -75,7 +75,7 @@ def sensor_faults(
 def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lambda _text: None) -> list[Explanation]:
     """Return the faults of pairs of channels, then of single ones, with equal faults of several channels merged."""
     total = sum(excess(one.apart) for one in shown)
-    off = {x.name: x for x in shown if x.counts is not None or (len(x.values) > MIN_ROWS and x.differs)}
+    off = {x.name: x for x in shown if x.counts is not None or (len(x.values) > MIN_ROWS and _differs(x.apart))}
     explain = _ExplanationMaker(total, end_s)
     faults, names = [], set()
     for a, b in combinations(off.values(), 2):
@@ -97,6 +97,11 @@ def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lam
         step(f"faults of {one.name}, {n} of {len(singles)}")
         alone.append(_explain_channel(one, explain))
     return faults + _merge_equal(alone, explain, [one.name for one in shown if one.moves])
+
+
+def _differs(residuals: np.ndarray) -> bool:
+    """Return whether residuals over their floors, shape (n,), or their mean are not noise."""
+    return not is_noise(residuals) or abs(residuals.sum()) > OUTLIER * math.sqrt(len(residuals))
 
 
 def extend(part: Measured, expected: np.ndarray, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
