@@ -17,6 +17,8 @@ from drivers.sources.stream import RigStream
 from rig.base.files import Closing
 from rig.serve.transport import Client
 
+_END_S = 5.0
+"""Longest wait for calls to end [s]."""
 _MAX_CALLS = 64
 """Number of calls and events at a time; further ones are refused."""
 
@@ -67,6 +69,7 @@ class DaqmxServer(Closing):
 
     def close(self) -> None:
         """End all calls and tasks."""
-        self._server.stop(grace=None).wait()
-        self._servicer.close()
+        stopped = self._server.stop(grace=None)
+        self._servicer.close()  # ends calls that wait for samples
+        stopped.wait(timeout=_END_S)
         self._pool.shutdown(wait=False, cancel_futures=True)

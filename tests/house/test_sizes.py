@@ -23,7 +23,7 @@ SLACK = 50
 BUDGETS = {
     "drivers": 714,
     "drivers/can": 4538,
-    "drivers/daqmx": 1314,
+    "drivers/daqmx": 1316,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,

@@ -140,7 +140,7 @@ def test_the_window_is_shorter_for_less_certain_starts(file: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--fit", "contact.frictionn"], "a parameter, a number of the scene"),
+        (["--fit", "contact.frictionn"], "a parameter, of a number of the scene"),
         (["--fit", "contact.frictionn"], "such as contact.friction"),
         (["--fit", "engine.step_us"], "not the simulation"),
         (["--fit", "sensors.rate_hz"], "not the simulation"),
