@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,11 @@ from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured
 from replays.recordings.resimulation.sensitivity import ANGLE, PHASE, get_value, with_values
 from replays.recordings.validation import load_criteria, validate
+from replays.recordings.validation.comparison import explain_assumed
+from replays.recordings.validation.explanations.attribution import Explained
 from replays.recordings.validation.explanations.budget import make_fit_budgets
 from replays.recordings.validation.explanations.channel_fit import Shown
+from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import sensor_faults
 from replays.recordings.validation.explanations.signals import edge_faults
 from replays.recordings.validation.explanations.timing import filtered
@@ -204,6 +208,19 @@ def test_an_offset_below_the_noise_is_found_by_its_mean(offset: float) -> None:
     assert (found.good, found.rms < found.limit, found.drift > 10.0) == (not offset, True, bool(offset))
     (fault,) = sensor_faults({"forces": part}, Prediction({"forces": 0.0 * values}, {}, 1), 9.0) or (None,)
     assert (fault and fault.name) == ("P_W offset" if offset else None)
+
+
+@pytest.mark.parametrize(("others", "named"), [("inner_x inner_y", True), ("inner_x P_S P_E P_W", False)])
+def test_a_fault_that_moves_few_other_channels_is_named(others: str, named: bool) -> None:
+    """It moves others through the fit; but many channels that fail without a cause contradict it."""
+    fault = Explanation("sensor", "P_N AC coupling", "corner at 4 Hz", 4.0, "Hz", 1.0, 1.0, 9.0, 9, 1.0)
+    log: Any = SimpleNamespace(scene={"import": {"mapping": {"channels": {}}}}, table=default_table())
+    explained = Explained(0.0, 1.0, (fault,), "sensor: P_N AC coupling", (fault.name,))
+    found = explain_assumed(explained, log, ["P_N", *others.split()])
+    assert found.best == ((fault.name,) if named else ())
+    assert named == found.conclusion.endswith(
+        "; inner_x fails without a known cause; inner_y fails without a known cause"
+    )
 
 
 def test_floated_friction_of_a_log_is_fitted_and_the_rest_is_judged_with_it(mils: Recording) -> None:

@@ -483,8 +483,9 @@ def explain_assumed(explained: Explained, recording: Recording, failed: Sequence
     if best and all(one.kind == "sensor" for one in best):
         known = select_channels(best, failed)
         rest = [name for name in failed if name not in known]
-        if len(rest) > len(known):
-            # Channels that most others contradict are not the cause, however large their part of the squares is.
+        if len(rest) > len(known) and len(failed) > FEW_CHANNELS * len(recording.table.channels):
+            # What many others contradict is not the cause, however large its part of the squares is; few others may
+            # fail as it moved the fit.
             text = f"{len(rest)} of {len(failed)} channels that fail have no known cause: the model differs, or "
             conclusion = f"{text}several faults; closest is {conclusion.removeprefix('sensor: ')}"
             return replace(explained, conclusion=conclusion, ranked=tuple(ranked), best=())
