@@ -206,6 +206,7 @@ def test_an_offset_below_the_noise_is_found_by_its_mean(offset: float) -> None:
     part = Measured("forces", (channel,), times_s, np.arange(2000), values, np.ones(1), np.array([True]), ideal=False)
     (found,) = residuals({"forces": part}, {"forces": values}, load_criteria())
     assert (found.good, found.rms < found.limit, found.drift > 10.0) == (not offset, True, bool(offset))
+    assert found.first_s == (0.0 if offset else None)
     (fault,) = sensor_faults({"forces": part}, Prediction({"forces": 0.0 * values}, {}, 1), 9.0) or (None,)
     assert (fault and fault.name) == ("P_W offset" if offset else None)
 
@@ -214,9 +215,10 @@ def test_an_offset_below_the_noise_is_found_by_its_mean(offset: float) -> None:
 def test_a_fault_that_moves_few_other_channels_is_named(others: str, named: bool) -> None:
     """It moves others through the fit; but many channels that fail without a cause contradict it."""
     fault = Explanation("sensor", "P_N AC coupling", "corner at 4 Hz", 4.0, "Hz", 1.0, 1.0, 9.0, 9, 1.0)
+    names = [one for one in default_table().channels if one != "hammer"]
     log: Any = SimpleNamespace(scene={"import": {"mapping": {"channels": {}}}}, table=default_table())
     explained = Explained(0.0, 1.0, (fault,), "sensor: P_N AC coupling", (fault.name,))
-    found = explain_assumed(explained, log, ["P_N", *others.split()])
+    found = explain_assumed(explained, log, {one: one not in ("P_N", *others.split()) for one in names})
     assert found.best == ((fault.name,) if named else ())
     assert named == found.conclusion.endswith(
         "; inner_x fails without a known cause; inner_y fails without a known cause"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -181,8 +181,8 @@ def validate(
             text = f"closest is {explained.conclusion}; but {min(off)} of {len(judged)} quantities are still off"
             text += ": another number, or several at once; `rig identify` fits them"
             explained = replace(explained, conclusion=text, best=())
-    failed = [one.channel for one in trajectory if one.good is False]
-    return replace(validation, explained=explain_assumed(explained, recording, failed))
+    passed = {one.channel: one.good for one in trajectory if one.good is not None}
+    return replace(validation, explained=explain_assumed(explained, recording, passed))
 
 
 def _check_request(recording: Recording, experiment: Experiment, criteria: Criteria, *, budget: bool) -> None:
@@ -462,14 +462,15 @@ def find_assumed_corners(recording: Recording) -> dict[str, float]:
     return {name: known[name].bandwidth_hz for name, entry in mapped.items() if "bandwidth_hz" not in entry}
 
 
-def explain_assumed(explained: Explained, recording: Recording, failed: Sequence[str]) -> Explained:
+def explain_assumed(explained: Explained, recording: Recording, passed: Mapping[str, bool]) -> Explained:
     """Return an explanation of a log that distinguishes an assumed low-pass from a wrong one, and lists open channels.
 
     Args:
         explained: The explanation.
         recording: The log.
-        failed: Channels that fail.
+        passed: Whether each judged channel passes.
     """
+    failed = [name for name, good in passed.items() if not good]
     corners, conclusion, ranked = find_assumed_corners(recording), explained.conclusion, []
     for one in explained.ranked:
         name, defect = one.channels_and_defect
@@ -483,7 +484,7 @@ def explain_assumed(explained: Explained, recording: Recording, failed: Sequence
     if best and all(one.kind == "sensor" for one in best):
         known = select_channels(best, failed)
         rest = [name for name in failed if name not in known]
-        if len(rest) > len(known) and len(failed) > FEW_CHANNELS * len(recording.table.channels):
+        if len(rest) > len(known) and len(failed) > FEW_CHANNELS * len(passed):
             # What many others contradict is not the cause, however large its part of the squares is; few others may
             # fail as it moved the fit.
             text = f"{len(rest)} of {len(failed)} channels that fail have no known cause: the model differs, or "

@@ -233,12 +233,10 @@ def _judge(part: Measured, c: int, z: np.ndarray, criterion: TrajectoryCriterion
         good = peak <= peak_limit and rms <= limit and drift <= drift_limit
         if not good:
             over = np.flatnonzero(np.abs(z) > min(criterion.peak, _NOISE_LIMIT))
-            starts = [float(part.times_s[over[0]])] if len(over) else []
-            slow = np.flatnonzero(np.abs(means) > drift_limit)
-            starts += [float(part.times_s[slow[0] * STRETCH])] if len(slow) else []
-            loud = block_means(z**2, STRETCH)
-            starts = starts or [float(part.times_s[int(np.argmax(loud)) * STRETCH])] if len(loud) else starts
-            first = min(starts, default=float(part.times_s[0]))
+            slow = STRETCH * np.flatnonzero(np.abs(means) > drift_limit)
+            loud = STRETCH * np.argmax(block_means(z**2, STRETCH), keepdims=True) if rms > limit and len(means) else ()
+            starts = np.concatenate([over, slow]) if len(over) or len(slow) else loud
+            first = float(part.times_s[int(min(starts, default=0))])
     channel = part.channels[c]
     unit = "" if channel.unit == "1" else channel.unit
     return ChannelResidual(
