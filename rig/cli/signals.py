@@ -57,21 +57,34 @@ def ignore() -> None:
 
 @contextmanager
 def stop_on_signals(stop: Callable[[], object]) -> Iterator[None]:
-    """Call `stop` on SIGINT, SIGTERM and SIGHUP; a second SIGINT interrupts at once."""
+    """Call `stop` on SIGINT, SIGTERM or SIGHUP, in a thread of its own; a second SIGINT interrupts at once."""
+    import threading
+    from queue import SimpleQueue
+
     ended: list[int] = []
+    # Only a flag or this queue may be used in a handler: the code that it interrupts may hold the lock of an event.
+    received = SimpleQueue[int | None]()
 
     def handle(number: int, _: object) -> None:
         ended.append(number)
         if number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-        stop()
+        received.put(number)
 
+    def stop_once() -> None:
+        if received.get() is not None:
+            stop()
+
+    stopper = threading.Thread(target=stop_once, name="signals", daemon=True)
+    stopper.start()
     former = {number: signal.signal(number, handle) for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN}
-    if _received:
-        stop()
+    for number in _received[:1]:
+        received.put(number)
     try:
         yield
     finally:
         for number, handler in former.items():
             # While the command ends, only a second SIGINT has an effect.
             signal.signal(number, signal.SIG_IGN if ended and number != signal.SIGINT else handler)
+        received.put(None)
+        stopper.join()

@@ -107,7 +107,7 @@ class ServedRun(ABC):
     # ---- from any thread ----
 
     def stop(self) -> None:
-        """End the run at the next block boundary; from any thread or signal handler."""
+        """End the run at the next block boundary; from any thread."""
         self._stop_requested = True
         self._wake()
 

@@ -48,7 +48,7 @@ BUDGETS = {
     "rig": 64,
     "rig/base": 1079,
     "rig/channels": 2594,
-    "rig/cli": 6281,
+    "rig/cli": 6291,
     "rig/ensemble": 2019,
     "rig/physics": 5488,
     "rig/run": 1896,
