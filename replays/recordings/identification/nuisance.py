@@ -535,7 +535,7 @@ def _fit_windows(
         def fitted(start: np.ndarray) -> tuple[np.ndarray, ChannelState, list[float]]:
             fit, here = approach(predictor, start, priors, by_residuals=by_residuals, enabled=every)  # noqa: B023
             enabled = select_sound([rms(z) if has else math.inf for z, has in zip(here.apart, every, strict=True)])
-            if not all(enabled):
+            if enabled != every:
                 fit, here = approach(predictor, fit, priors, by_residuals=True, enabled=enabled)  # noqa: B023
             return fit, here, [max(1.0, rms(z)) for z in here.apart]
 
