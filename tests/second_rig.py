@@ -334,7 +334,7 @@ def add_noise(
     f = np.fft.rfftfreq(n, own_s[1] - own_s[0])
     f[0] = f[1]
     noisy = dict(values)
-    for name in values.keys() - {"keyphasor"}:
+    for name in (one for one in values if one != "keyphasor"):
         lines_of_noise = rng.standard_normal(len(f)) + 1j * rng.standard_normal(len(f))
         more = level * np.fft.irfft(lines_of_noise * (100.0 / f) ** (0.5 * slope), n) * math.sqrt(n / 2.0)
         for k in range(lines):

@@ -153,7 +153,7 @@ def _merge_groups(file: _File) -> dict[str, Any]:
     sources = [(f"groups.{name}.defaults", group.defaults) for name, group in file.groups.items()]
     sources += [(f"channel {row.name}", row.model_dump()) for group in file.groups.values() for row in group.channels]
     for field_prefix, fields in [*sources, *((f"channels.{name}", changes) for name, changes in file.channels.items())]:
-        for name in {"rate_hz", "group", "kind"} & set(fields):
+        for name in (one for one in ("rate_hz", "group", "kind") if one in fields):
             raise InputError(f"{field_prefix}.{name}", "left out: it is the group's", fields[name])
     for name, group in file.groups.items():
         if name not in groups and not group.channels:

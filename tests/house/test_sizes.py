@@ -47,7 +47,7 @@ BUDGETS = {
     "replays/studies": 9981,
     "rig": 64,
     "rig/base": 1079,
-    "rig/channels": 2594,
+    "rig/channels": 2595,
     "rig/cli": 6291,
     "rig/ensemble": 2019,
     "rig/physics": 5488,

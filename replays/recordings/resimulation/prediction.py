@@ -297,7 +297,7 @@ class _Channels:
             groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal, digital=digital,
             columns=formulas.columns(groups),
         )  # fmt: skip
-        self._formulas, self._last, self._rows = formulas, np.empty((0, 0)), np.empty((0, 0))
+        self._formulas, self._last, self._rows, self._converted = formulas, np.empty((0, 0)), np.empty((0, 0)), 0
         signals = [channel.signal for part in parts for channel in part.channels]
         self._from_speeds = from_speeds and any(name in signal for name in _ACCELERATION_NAMES for signal in signals)
         self._counts: dict[str, list[np.ndarray]] = {part.group: [] for part in parts}
@@ -308,37 +308,35 @@ class _Channels:
         self._first = row * self._in_a_row // self.apart
 
     def take(self, rows: np.ndarray) -> None:
-        if self._from_speeds:
-            rows = self._differentiate(rows)
-        if len(rows):
-            self._convert(rows)
-
-    def _differentiate(self, rows: np.ndarray) -> np.ndarray:
-        """Return the rows up to the last but two, with accelerations of the houses derived from their speeds."""
-        rows = np.concatenate([self._rows, rows]) if len(self._rows) else rows
-        self._rows, smooth = rows[-4:].copy(), rows[:-2].copy()
-        if len(rows) < 5:
+        late = 2 if self._from_speeds else 0
+        rows = np.concatenate([self._rows if len(self._rows) else rows[:0], rows])
+        if len(rows) <= 2 * late:
             self._rows = rows
-            return rows[:0]
-        v = rows[:, _SPEEDS]
-        smooth[2:, _ACCELERATIONS] = (8.0 * (v[3:-1] - v[1:-3]) - v[4:] + v[:-4]) * (self._row_rate_hz / 12.0)
-        return smooth[2:] if len(self._last) else smooth
+            return
+        end = len(rows) - late
+        if late:
+            v = rows[:, _SPEEDS]
+            rows[2:end, _ACCELERATIONS] = (8.0 * (v[3:-1] - v[1:-3]) - v[4:] + v[:-4]) * (self._row_rate_hz / 12.0)
+        self._convert(rows[self._converted : end])
+        self._converted = late // 2  # of the rows that are kept: the last one, with one before it for differences
+        self._rows = rows[end - 1 - self._converted :].copy()
 
     def _convert(self, rows: np.ndarray) -> None:
-        if len(self._last):
-            rows = np.concatenate([self._last, rows])
+        """Convert rows, which start with the last one of the previous call."""
         self._last = rows[-1:].copy()
         for name, counts in self._conditioner.counts(rows, self._formulas.values(rows)).items():
             self._counts[name].append(counts)
 
     def values(self) -> dict[str, np.ndarray]:
-        self._convert(self._last)  # for the sample on the last row
+        self._convert(np.repeat(self._last, 2, axis=0))  # for the sample on the last row
         values_by_group = {}
         for part in self._parts:
-            values = self._groups[part.group].engineering(np.concatenate(self._counts[part.group]))
+            counts = np.concatenate(self._counts[part.group])
             for c, lead in enumerate(self._leads[part.group]):
-                values[:, c] = values[np.minimum(np.arange(len(values)) + lead, len(values) - 1), c]
-            values_by_group[part.group] = interpolate_rows(values, part.times_s * self._rate_hz - self._first)
+                if lead:
+                    counts[:, c] = counts[np.minimum(np.arange(len(counts)) + lead, len(counts) - 1), c]
+            counts = interpolate_rows(counts, part.times_s * self._rate_hz - self._first)
+            values_by_group[part.group] = self._groups[part.group].engineering(counts)
         return values_by_group
 
 

@@ -402,7 +402,8 @@ class Conditioner:
         """Return the signals of the channels with linear-phase filters after these [SI], shape (n, such channels)."""
         of = self._with_taps
         gain, bias, low, high = (self._scales[:, row].ravel()[of] for row in (_GAIN, _BIAS, _LOW, _HIGH))
-        volts = np.clip(bias + gain * np.hstack([rows, made])[:, self._columns[of]], low, high)
+        signals = [*rows.T, *made.T]
+        volts = np.clip(bias + gain * np.column_stack([signals[c] for c in self._columns[of]]), low, high)
         if self._tail is None:
             self._tail = np.repeat(volts[:1], len(self._taps) - 1, axis=0)
             for c, tail in self._inherited_tails.items():
