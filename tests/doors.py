@@ -372,11 +372,11 @@ class Door:
     """Options of a server that accepts commands."""
     refusal: tuple[Any, str] = (RefusedError, "")
     """Error of a command without `--allow-commands`."""
-    stall_settings: ClassVar[dict[str, Any]] = {"buffer_s": 0.2}
+    stall_settings: ClassVar[dict[str, Any]] = {"buffer_s": 0.6}
     """Settings of a client that loses samples soon if it stalls."""
     stall_options: tuple[str, ...] = ()
     """Options of a server whose clients lose samples soon if they stall."""
-    stall_s = 1.0
+    stall_s = 1.5
     """Stall of a reader after which it has lost samples [s]."""
 
     def __init__(self) -> None:
@@ -468,7 +468,7 @@ class DaqmxDoor(ServerDoor):
     """NI-DAQmx over gRPC."""
 
     name, ready, client = "daqmx", "NI-DAQmx device", DaqmxClient
-    stall_settings: ClassVar[dict[str, Any]] = {"buffer": 2000}
+    stall_settings: ClassVar[dict[str, Any]] = {"buffer": 12_000}
     refusal = nidaqmx.DaqError, "-200022"
 
     def attack(self, address: Any, draw: random.Random, count: int) -> None:

@@ -167,8 +167,8 @@ def test_a_stalled_reader_learns_of_its_loss_and_delays_nobody(name: str) -> Non
         start_rig(door) as child,
         Console.open(f"zenoh:{door.endpoint}", wait_s=PATIENCE_S) as console,
         door.serve(*door.stall_options) as (_, address),
-        door.open(table, address, **door.stall_settings) as stalled,
         door.open(table, address) as steady,
+        door.open(table, address, **door.stall_settings) as stalled,
     ):
         stalled.receive()
         begin_s = console.status()["time_s"]
