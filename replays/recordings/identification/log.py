@@ -64,7 +64,7 @@ def identify_log(
     along = [key for key in NUISANCES if key not in keys and (mark is None or key != ANGLE)]
     tuned = tune(
         recording, first.experiment, (*keys, *along), priors=priors or {},
-        channels=channels, to_s=to_s, progress=progress,
+        channels=channels, to_s=to_s, variants=variants, progress=progress,
     )  # fmt: skip
     nuisances = find_nuisances(tuned.baseline, along)
     all_priors = {key: prior for key, prior in nuisances.items() if prior is not None} | dict(priors or {})
@@ -107,8 +107,10 @@ def identify_log(
     judgement = replace(judgement, findings=tuple(
         replace(one, unknown=replace(one.unknown, start=begun[one.unknown.key])) for one in judgement.findings
     ))  # fmt: skip
-    why = f"the fit uses {1e3 * (tuned.longest_s - first_s):.3g} ms from the hammer pulse on"
-    if tuned.end_s < tuned.longest_s:
+    why = f"the fit uses {1e3 * (tuned.end_s - first_s):.3g} ms from the hammer pulse on"
+    if tuned.end_s > tuned.parted_s - 1e-9:
+        why += "; from then on, equally valid friction laws differ"
+    elif tuned.end_s < tuned.longest_s:
         why = f"no values of these keys explain the samples to {tuned.longest_s:.4f} s: the contact law (exponent, "
         why += "damping, friction law) or a number that is not fitted, such as a house stiffness, differs"
         if any(one.standing == "not seen" for one in judgement.findings[: len(keys)]):

@@ -167,6 +167,7 @@ class Tuned:
         about_s: Time at which the clocks differ by the offset alone [s].
         end_s: End of the samples of the fit [s].
         longest_s: End of the samples if the model had explained all of them [s].
+        parted_s: Time from which equally valid models differ, where the fit ends [s]; infinite if there is none.
         scales: Residual rms over noise of each channel, at least 1.
         spectra: Spectrum of the noise of each channel that is not white, by name.
         parts: Samples of the fit.
@@ -181,6 +182,7 @@ class Tuned:
     about_s: float
     end_s: float
     longest_s: float
+    parted_s: float
     scales: dict[str, float]
     spectra: dict[str, NoiseSpectrum]
     parts: dict[str, Measured] = field(repr=False)
@@ -396,6 +398,7 @@ def tune(
         about_s=min(float(part.times_s[0]) for part in whole.values()),
         end_s=fit.end_s,
         longest_s=end_s,
+        parted_s=fit.parted_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), fit.scales, strict=True)),
         spectra={name: one for part in whole.values() for name, one in part.named_spectra if one is not None},
         parts={name: part.select_until(fit.end_s) for name, part in whole.items()},
@@ -444,6 +447,7 @@ class _WindowFit:
         end_s: End of the window [s].
         scales: Residual rms over noise of each channel, at least 1.
         jackknife: Half of 95 % intervals by a jackknife, shape (keys,).
+        parted_s: Time from which equally valid models differ [s]; infinite if there is none.
     """
 
     values: np.ndarray
@@ -452,6 +456,7 @@ class _WindowFit:
     end_s: float
     scales: list[float]
     jackknife: np.ndarray
+    parted_s: float
 
     @property
     def median_scale(self) -> float:
@@ -521,7 +526,7 @@ def _fit_windows(
     first_s, every = _pulse_time_s(baseline), [name not in without for part in whole.values() for name in part.names]
     values = np.array([get_value(baseline, key) for key in wanted])
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
-    jackknife, rows = np.zeros(len(values)), list[int]()
+    jackknife, rows, parted_s = np.zeros(len(values)), list[int](), math.inf
     lengths, last_s, halvings = list(_WINDOWS_S), 0.0, 0
     while lengths:
         length = lengths.pop(0)
@@ -540,8 +545,8 @@ def _fit_windows(
             return fit, here, [max(1.0, rms(z)) for z in here.apart]
 
         fit, here, now = fitted(values)
-        if variants and (parted_s := _find_parting(baseline, predictor, fit, variants)) is not None:
-            variants = ()
+        if variants and (here_s := _find_parting(baseline, predictor, fit, variants)) is not None:
+            variants, parted_s = (), here_s
             if parted_s > first_s + last_s:  # later samples must not bend the motion before it
                 lengths = [parted_s - first_s]
                 continue
@@ -569,7 +574,7 @@ def _fit_windows(
         times = [part.times_s for part in parts.values() for _ in part.names]
         before = np.diag(priors[1] ** -2.0), np.zeros(len(values))
         end_s, jackknife = first_s + length, jackknife_half_widths(here, times, scales, before, first_s)
-    return _WindowFit(values, covariance, np.array(moves[-_COUNTED_GROWTHS:]), end_s, scales, jackknife)
+    return _WindowFit(values, covariance, np.array(moves[-_COUNTED_GROWTHS:]), end_s, scales, jackknife, parted_s)
 
 
 def _find_parting(
