@@ -297,7 +297,7 @@ class _Channels:
             groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal, digital=digital,
             columns=formulas.columns(groups),
         )  # fmt: skip
-        self._formulas, self._last, self._rows, self._converted = formulas, np.empty((0, 0)), np.empty((0, 0)), 0
+        self._formulas, self._rows, self._converted = formulas, np.empty((0, 0)), 0
         signals = [channel.signal for part in parts for channel in part.channels]
         self._from_speeds = from_speeds and any(name in signal for name in _ACCELERATION_NAMES for signal in signals)
         self._counts: dict[str, list[np.ndarray]] = {part.group: [] for part in parts}
@@ -308,6 +308,7 @@ class _Channels:
         self._first = row * self._in_a_row // self.apart
 
     def take(self, rows: np.ndarray) -> None:
+        """Convert further rows, those with accelerations from speeds up to the last but two."""
         late = 2 if self._from_speeds else 0
         rows = np.concatenate([self._rows if len(self._rows) else rows[:0], rows])
         if len(rows) <= 2 * late:
@@ -323,12 +324,11 @@ class _Channels:
 
     def _convert(self, rows: np.ndarray) -> None:
         """Convert rows, which start with the last one of the previous call."""
-        self._last = rows[-1:].copy()
         for name, counts in self._conditioner.counts(rows, self._formulas.values(rows)).items():
             self._counts[name].append(counts)
 
     def values(self) -> dict[str, np.ndarray]:
-        self._convert(np.repeat(self._last, 2, axis=0))  # for the sample on the last row
+        self._convert(self._rows[[self._converted, self._converted]])  # for the sample on the last row
         values_by_group = {}
         for part in self._parts:
             counts = np.concatenate(self._counts[part.group])
