@@ -39,6 +39,8 @@ class MotionStart(NamedTuple):
     vx: float = 0.0  # [m/s]
     vy: float = 0.0
     angle: float = 0.0  # theta [rad]
+    state: tuple[float, ...] = ()
+    """Whole state [SI], shape (N_STATE,), which replaces these values and the rest of the housings."""
 
 
 def initial_state(model: Model, initial: Initial, begin: MotionStart | None, *, spin: float) -> np.ndarray:
@@ -55,6 +57,8 @@ def initial_state(model: Model, initial: Initial, begin: MotionStart | None, *, 
     """
     contact, inside = model.constants.contact, "inside the ring (r0 = {:g} mm)".format
     if begin is not None:
+        if begin.state:
+            return np.concatenate([begin.state, np.zeros(S.N_VECTOR - S.N_STATE)])
         if math.hypot(begin.ring_x, begin.ring_y) >= contact.clearance:
             position = [begin.ring_x * 1e3, begin.ring_y * 1e3]
             raise InputError("begin", inside(contact.clearance * 1e3), position)

@@ -22,7 +22,7 @@ from replays.recordings.formats.conversion import convert, write_recording
 from replays.recordings.formats.mapping import load_mapping, parse_mapping
 from replays.recordings.identification.agreement import solve_weighted
 from replays.recordings.identification.log import identify_log
-from replays.recordings.identification.nuisance import Tuned, find_nuisances, tune
+from replays.recordings.identification.nuisance import NUISANCES, Tuned, find_nuisances, tune
 from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured
 from replays.recordings.resimulation.sensitivity import ANGLE, PHASE, get_value, with_values
@@ -252,13 +252,14 @@ def test_a_gain_error_changes_the_fit_of_a_log_as_its_budget_predicts(
 ) -> None:
     rules = load_criteria().imported
     tuned = tune_few_channels(tmp_path / "right", motion)
-    wrong = tune_few_channels(tmp_path / "wrong", motion, outer_y=1.0 + rules.calibration)
+    times = 5.0  # so that the fit, which ends within a tenth of the noise, shows it
+    wrong = tune_few_channels(tmp_path / "wrong", motion, outer_y=1.0 + times * rules.calibration)
     compared = 0
     for budget in make_fit_budgets(tuned, rules):
         expected = budget.by_gain["outer_y"]
         if abs(expected) > 0.1 * budget.contributions["noise"]:
             moved = wrong.values[budget.name] - tuned.values[budget.name]
-            assert moved == pytest.approx(expected, rel=0.3), budget.name
+            assert moved == pytest.approx(times * expected, rel=0.3), budget.name
             compared += 1
     assert compared >= 10
 
@@ -555,6 +556,18 @@ FIVE = (
     "house.inner_beam_damping",
 )  # fmt: skip
 slow_test = pytest.mark.skipif("RIG_COVERAGE_SEEDS" not in os.environ, reason="RIG_COVERAGE_SEEDS=40: ten minutes")
+
+
+def test_motion_due_to_a_wrong_model_is_not_noise(tmp_path: Path) -> None:
+    """With a stiffness that is 4 % off, motion of the probes before the pulse would be taken for slow noise."""
+    motion = second_rig.simulate_pulse(second_rig.Rig(K_mag=1770.0), turned=1.0, settled_s=1.5, after_s=0.1)
+    recording = import_all_channels(tmp_path, motion, seed=3, slope=1.0, level=0.5, lines=1)
+    keys = ("magnet.stiffness", *NUISANCES)
+    found = tune(recording, Experiment.from_recording(recording), keys, to_s=0.804)
+    assert abs(found.values["magnet.stiffness"] - 1.77) < found.fitted[0].half_width < 0.1
+    assert max(found.scales.values()) < 1.1
+    excess = {name: found.spectra[name].excess for name in ("disk_x", "disk_y", "ring_x", "ring_y", "P_E")}
+    assert max(excess.values()) < 1.2 * min(excess.values())
 
 
 @slow_test

@@ -13,6 +13,7 @@ from replays.recordings.resimulation.prediction import LeadIns, Measured, interp
 from replays.recordings.resimulation.sensitivity import Predictor, get_value, with_values
 from rig.base.errors import InputError
 from rig.channels.table import Channel, default_table
+from rig.run.motion import MotionStart
 from rig.run.offline import SentCommand, simulate
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
@@ -76,6 +77,65 @@ def test_a_late_start_is_the_same_as_from_the_start(sent: tuple[SentCommand, ...
     whole, late = (shown(experiment, "ring_x", "inner_x", start_s=start, end_s=3.6)[-100:] for start in (0.0, 3.5))
     assert np.abs(whole[:, 0] - late[:, 0]).max() < 1e-8
     assert np.abs(whole[:, 1] - late[:, 1]).max() < 1e-3 * np.abs(whole[:, 1]).max()
+
+
+def running(**changes: Any) -> Experiment:
+    """Return the experiment of a log of a running rig, with a hammer pulse at 0.85 s."""
+    pulse = {"at_s": 0.85, "command": "hammer", "force_n": 90.0, "duration_ms": 5.0, "direction": "x"}
+    scene = load_scene("hammer", {"duration_s": 1.0, "commands": [pulse], **changes})
+    return Experiment(scene=scene, begin=MotionStart(300_000, 1e-5, -2e-5, 1e-3, 2e-3, angle=1.0), imported=True)
+
+
+@pytest.mark.parametrize("rate_hz", [2048, 3001, 16_384])
+def test_samples_do_not_depend_on_whether_one_falls_on_the_start(rate_hz: int) -> None:
+    """At these rates none falls on 0.3 s; at times that no row shows, channels are interpolated."""
+    index = np.arange(round(0.33 * rate_hz), round(0.5 * rate_hz))
+    rows = make_rows(("disk_x",), index / rate_hz, rate_hz=rate_hz, bandwidth_hz=300.0)
+    between = make_rows(("disk_x",), (index + 2e-6) / rate_hz, rate_hz=rate_hz, bandwidth_hz=300.0)
+    exact, near = (predict(simplify(running()), one).values["disk_x"] for one in (rows, between))
+    assert np.abs(exact - near).max() < 1e-5 * np.ptp(exact)
+
+
+@pytest.mark.parametrize(
+    ("own", "divided"),
+    [
+        ({}, True),
+        ({"filter": "fir", "filter_order": 64}, True),
+        ({"filter": "sinc", "filter_order": 3}, True),
+        ({"filter": "chebyshev", "bandwidth_hz": 8500.0}, True),
+        ({"bandwidth_hz": 30_000.0}, False),
+        ({"highpass_hz": 0.3}, False),  # settles for seconds
+    ],
+)
+def test_a_quiet_stretch_is_predicted_apart_where_it_can_be(own: dict[str, Any], divided: bool) -> None:
+    own = {"bandwidth_hz": 5000.0, "highpass_hz": 0.0} | own
+    rows = make_rows(("disk_x", "P_E", "inner_x", "hammer"), np.arange(6200, 17_400) / 20_000, **own)
+    keys = ("shaft.unbalance_phase", "state.vx", "clock.offset_s", "contact.friction", "hammer.1.force_n")
+    single, apart = (Predictor(running(), keys, rows, quiet_until_s=until_s) for until_s in (-np.inf, 0.82))
+    values = np.add(single.start, [0.01, 0.2, 3e-6, 0.01, 1.0])
+    for part in (0.0, 1e-3, 1e-2):  # the keys of contact and hammer do not change the quiet stretch
+        z = np.add(values, [0.0, 0.0, 0.0, part, 10.0 * part])
+        one, other = single.predict(z), apart.predict(z)
+        assert one.contacts == other.contacts > 2
+        assert (len(other.truth["state"]) < len(one.truth["state"])) is divided
+        for name, value in one.values.items():
+            assert np.abs(value - other.values[name]).max() < 1e-5 * np.ptp(value)
+
+
+def test_no_quiet_stretch_ends_after_a_contact() -> None:
+    rows = make_rows(("disk_x",), np.arange(6200, 19_000) / 20_000)
+    for until_s in (0.9, 1.2):
+        single, late = (Predictor(running(), (), rows, quiet_until_s=one).predict(()) for one in (-np.inf, until_s))
+        assert single.values["disk_x"].tobytes() == late.values["disk_x"].tobytes()
+
+
+def test_the_prediction_of_a_log_is_accurate_after_many_impacts() -> None:
+    """With the engine's default tolerance the error after ten impacts is a hundred times as large."""
+    rows = make_rows(("inner_x",), np.arange(16_000, 17_600) / 20_000)
+    finest = simplify(running()).with_changes({"engine.tolerance": 1e-7})
+    usual, fine = (predict(one, rows) for one in (simplify(running()), finest))
+    assert usual.contacts == fine.contacts > 8
+    assert np.abs(usual.values["inner_x"] - fine.values["inner_x"]).max() < 1e-4 * np.abs(fine.values["inner_x"]).max()
 
 
 def test_experiments_share_the_run_before_their_first_difference() -> None:

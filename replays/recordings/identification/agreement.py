@@ -103,7 +103,13 @@ class ChannelState:
 
 
 def approach(
-    predictor: Predictor, values: np.ndarray, priors: np.ndarray, *, by_residuals: bool, enabled: Sequence[bool]
+    predictor: Predictor,
+    values: np.ndarray,
+    priors: np.ndarray,
+    *,
+    by_residuals: bool,
+    enabled: Sequence[bool],
+    steps: int = _MAX_STEPS,
 ) -> tuple[np.ndarray, ChannelState]:
     """Search values near a start on which most channels agree.
 
@@ -113,6 +119,7 @@ def approach(
         priors: Means and standard deviations of the priors, shape (2, keys).
         by_residuals: True: channels are weighted by their residuals from the first step on; False: by their signals.
         enabled: Channels that are used.
+        steps: Largest number of steps.
 
     Returns:
         The values, and the channels at them.
@@ -121,7 +128,7 @@ def approach(
     low, high = means - MAX_PRIOR_DEVIATION * deviations, means + MAX_PRIOR_DEVIATION * deviations
     here = evaluate(predictor, values)
     assert here is not None
-    for _ in range(_MAX_STEPS):
+    for _ in range(steps):
         slopes = [
             {name: predictor.parts[name].whiten(slope) for name, slope in one.items()}
             for one in predictor.derivatives(values).slopes

@@ -83,6 +83,8 @@ _FULL_RATE_S, _DECIMATION = 0.03, 8
 determine the state of the shaft."""
 _WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """Lengths of the fit windows from the start of the hammer pulse [s]."""
+_START_STEPS = 2
+"""Steps of the rough fit before the noise is measured."""
 _MIN_GROWTH_S = 1.6e-3
 """Growth of the window up to which it is halved if residuals grow [s]."""
 _MAX_HALVINGS = 8
@@ -367,7 +369,12 @@ def tune(
     whole = {name: part.remove_delays(late_s or {}) for name, part in whole.items()}
     whole = _with_spectra(recording, baseline, whole, end_s=first_s - _MARGIN_S)
     whole = {name: _decimate(part, first_s - _FULL_RATE_S) for name, part in whole.items()}
-    fit = _fit_best(baseline, wanted, whole, variants, progress)
+    start = None
+    if not set(wanted) <= set(NUISANCES):  # the motion due to a wrong value of the model is not noise
+        start = _find_start(baseline, wanted, whole)
+        values = dict(zip(wanted, start.tolist(), strict=True))
+        whole = _with_spectra(recording, baseline, whole, end_s=first_s - _MARGIN_S, values=values)
+    fit = _fit_best(baseline, wanted, whole, variants, progress, start=start)
     if max(fit.scales) > _FAULTY_RMS and (early := _with_earlier_pulse(baseline, whole)) is not None:
         other = _fit_windows(early, wanted, whole, variants, progress, by_residuals=True, without=("hammer",))
         if other.rank() > fit.rank():
@@ -406,9 +413,17 @@ def tune(
 
 
 def _with_spectra(
-    recording: Recording, experiment: Experiment, parts: dict[str, Measured], *, end_s: float
+    recording: Recording,
+    experiment: Experiment,
+    parts: dict[str, Measured],
+    *,
+    end_s: float,
+    values: Mapping[str, float] | None = None,
 ) -> dict[str, Measured]:
-    """Return parts with the spectra of their noise, from all samples of a log before an end [s]."""
+    """Return parts with the spectra of their noise, from all samples of a log before an end [s].
+
+    What the model shows, with the given values of the experiment, is not noise.
+    """
     if not experiment.imported:
         return parts  # the noise of the rig itself is white
     every = read_measured(recording, experiment.scene)
@@ -420,7 +435,9 @@ def _with_spectra(
     }
     if not all(len(part.times_s) for part in quiet.values()):
         return parts
-    quiet = with_spectra(quiet, Predictor(experiment, (), quiet).predict(()).values)
+    values, about_s = values or {}, min(float(part.times_s[0]) for part in parts.values())
+    predictor = Predictor(experiment, tuple(values), quiet, about_s=about_s)
+    quiet = with_spectra(quiet, predictor.predict(tuple(values.values())).values)
     return {name: replace(part, spectra=quiet[name].spectra) for name, part in parts.items()}
 
 
@@ -468,15 +485,37 @@ class _WindowFit:
         return self.end_s, -sum(map(math.log, self.scales))
 
 
+def _prepare(
+    baseline: Experiment, wanted: Mapping[str, tuple[float, float] | None], parts: dict[str, Measured]
+) -> tuple[Predictor, np.ndarray]:
+    """Return the predictor of a window, and means and standard deviations of the priors, shape (2, keys)."""
+    predictor = Predictor(baseline, tuple(wanted), parts, quiet_until_s=_pulse_time_s(baseline) - _FULL_RATE_S)
+    # Without a prior, a value is held so weakly that only one without any effect keeps its start.
+    loose = zip(predictor.start, predictor.scales, strict=True)
+    return predictor, np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
+
+
+def _find_start(
+    baseline: Experiment, wanted: Mapping[str, tuple[float, float] | None], whole: dict[str, Measured]
+) -> np.ndarray:
+    """Return values that fit the first window roughly, shape (keys,)."""
+    end_s = _pulse_time_s(baseline) + _WINDOWS_S[0]
+    predictor, priors = _prepare(baseline, wanted, {name: part.select_until(end_s) for name, part in whole.items()})
+    every = [True for part in whole.values() for _ in part.names]
+    return approach(predictor, predictor.start, priors, by_residuals=False, enabled=every, steps=_START_STEPS)[0]
+
+
 def _fit_best(
     baseline: Experiment,
     wanted: dict[str, tuple[float, float] | None],
     whole: dict[str, Measured],
     variants: Sequence[dict[str, Any]],
     progress: Callable[[str], None],
+    *,
+    start: np.ndarray | None = None,
 ) -> _WindowFit:
     """Return the best of several fits; if channels disagree, also fit by the majority, with and without the hammer."""
-    best = _fit_windows(baseline, wanted, whole, variants, progress, by_residuals=False)
+    best = _fit_windows(baseline, wanted, whole, variants, progress, by_residuals=False, start=start)
     for without in ((), ("hammer",)):
         early = without and best.end_s <= _pulse_time_s(baseline) + _WINDOWS_S[0]  # its own time
         if early or (max(best.scales) > _FAULTY_RMS and (best.median_scale > _FAULTY_RMS or not without)):
@@ -511,6 +550,7 @@ def _fit_windows(
     *,
     by_residuals: bool,
     without: Sequence[str] = (),
+    start: np.ndarray | None = None,
 ) -> _WindowFit:
     """Fit in windows that grow from the pulse.
 
@@ -522,9 +562,10 @@ def _fit_windows(
         progress: Callback for the current step.
         by_residuals: Weight channels by their residuals from the first step on, starting from the logged values.
         without: Channels that are not used.
+        start: Start of the search, shape (keys,); None: the values of the experiment.
     """
     first_s, every = _pulse_time_s(baseline), [name not in without for part in whole.values() for name in part.names]
-    values = np.array([get_value(baseline, key) for key in wanted])
+    values = np.array([get_value(baseline, key) for key in wanted]) if start is None else start
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
     jackknife, rows, parted_s = np.zeros(len(values)), list[int](), math.inf
     lengths, last_s, halvings = list(_WINDOWS_S), 0.0, 0
@@ -532,10 +573,7 @@ def _fit_windows(
         length = lengths.pop(0)
         progress(f"{len(wanted)} values, to {first_s + length:.4f} s of {first_s + _WINDOWS_S[-1]:.3f} s")
         parts = {name: part.select_until(first_s + length) for name, part in whole.items()}
-        predictor = Predictor(baseline, tuple(wanted), parts)
-        # Without a prior, a value is held so weakly that only one without any effect keeps its start.
-        loose = zip(predictor.start, predictor.scales, strict=True)
-        priors = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
+        predictor, priors = _prepare(baseline, wanted, parts)
 
         def fitted(start: np.ndarray) -> tuple[np.ndarray, ChannelState, list[float]]:
             fit, here = approach(predictor, start, priors, by_residuals=by_residuals, enabled=every)  # noqa: B023
@@ -584,7 +622,8 @@ def _find_parting(
     nominal = predictor.predict(values)
     if not nominal.contacts:
         return None
-    models = (Predictor(baseline.with_changes(changes), predictor.keys, predictor.parts) for changes in variants)
+    wanted = dict.fromkeys(predictor.keys)
+    models = (_prepare(baseline.with_changes(changes), wanted, predictor.parts)[0] for changes in variants)
     return foreseeable_s(predictor.parts, nominal, [model.predict(values) for model in models], share=1.0)
 
 

@@ -23,6 +23,7 @@ from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.sensors.filters import delay_s
 from rig.channels.table import Channel, Group, default_table
 from rig.physics.kernels.signals import TRUTH
+from rig.run.motion import MotionStart
 from rig.run.offline import frames
 from rig.run.scenes import Scene, rig_table
 from rig.run.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
@@ -37,12 +38,19 @@ _CHUNK_S = 0.1
 _LOG_ROW_TICKS = 10
 """Largest row spacing for a log [ticks]: an impact contains frequencies above half of the rig's own row rate, which the
 filters of a log never had to pass."""
+_LOG_TOLERANCE = 1e-6
+"""Largest tolerance of the engine for a log: later impacts amplify the error of a tolerance of 3e-4 to hundreds of
+noises, and a run of some impacts takes no longer with this one."""
 _POLYNOMIAL_ROWS = 3
 """Rows after a sample that a polynomial through six of them may need."""
 _LOW_PASS_SETTLING_S = 0.02
 """Settling time of the low-passes [s]."""
 _HIGH_PASS_SETTLING = 7.0
 """Settling time of high-passes, in time constants."""
+_QUIET_ROW_TICKS, _QUIET_GRID_TICKS = (20, 50), 10_000
+"""Row spacings for a quiet stretch, and the grid of the start after it [ticks]."""
+_MAX_QUIET_CORNER = 0.4
+"""Largest corner of a low-pass in a quiet stretch over the rate of its rows; one well above would be omitted."""
 _MAX_LEAD_INS = 8
 """Lead-ins kept: those of a central difference in two values, and some more."""
 
@@ -281,7 +289,7 @@ class _Channels:
                 sign between two rows makes a step in an acceleration, which its values at the rows do not locate.
         """
         self._parts, self._rate_hz, self._row_rate_hz = parts, rate_hz, row_rate_hz
-        self.apart, self._in_a_row = sample_spacing(rate_hz, row_rate_hz)
+        self.apart, _ = sample_spacing(rate_hz, row_rate_hz)
         # A compensated filter needs later rows: it is computed with a delay of whole samples, which is then removed.
         self._leads = {part.group: [math.ceil(lead_s(channel) * rate_hz) for channel in part.fine] for part in parts}
         groups = []
@@ -304,8 +312,8 @@ class _Channels:
         self._first = 0
 
     def begin(self, row: int) -> None:
-        """Skip the samples before a row on which a sample falls."""
-        self._first = row * self._in_a_row // self.apart
+        """Skip the samples before a row."""
+        self._first = self._conditioner.start_at(row)
 
     def take(self, rows: np.ndarray) -> None:
         """Convert further rows, those with accelerations from speeds up to the last but two."""
@@ -514,11 +522,71 @@ def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chun
     chunk = round(chunk_s * row_rate_hz)
     if chunk_s < _CHUNK_S or any(chunk % channels.apart for channels in taking):
         return 0
-    corners = [c.highpass_hz for part in parts.values() for c in part.channels if c.highpass_hz]
-    settled_s = _LOW_PASS_SETTLING_S + _HIGH_PASS_SETTLING / (2.0 * math.pi * min(corners, default=math.inf))
-    settled_s += max(2.0 * c.half_length_s + delay_s(c) for part in parts.values() for c in part.channels)
-    first_s = min(float(part.times_s[0]) for part in parts.values()) - settled_s
+    first_s = min(float(part.times_s[0]) for part in parts.values()) - _settling_s(parts)
     return max(0, math.floor(first_s / chunk_s)) * chunk * (TICK_RATE_HZ // row_rate_hz)
+
+
+def _settling_s(parts: Mapping[str, Measured]) -> float:
+    """Return the time after which the filters of all channels have settled [s]."""
+    channels = [channel for part in parts.values() for channel in part.channels]
+    corners = [channel.highpass_hz for channel in channels if channel.highpass_hz]
+    settled_s = _LOW_PASS_SETTLING_S + _HIGH_PASS_SETTLING / (2.0 * math.pi * min(corners, default=math.inf))
+    return settled_s + max(2.0 * channel.half_length_s + delay_s(channel) for channel in channels)
+
+
+class QuietStretch:
+    """Prediction with rows further apart before the first contact, kept for experiments that differ only later.
+
+    Without a contact, an engine's motion is exact at any row spacing.
+    """
+
+    def __init__(self, parts: Mapping[str, Measured], until_s: float) -> None:
+        """Set up the prediction of the samples of some channels, of which those before a time are quiet [s]."""
+        self._rows = {name: part.count_rows(until_s) for name, part in parts.items()}
+        corners = [c.bandwidth_hz for part in parts.values() for c in part.channels if not math.isinf(c.bandwidth_hz)]
+        highest_hz = max(corners, default=0.0) / _MAX_QUIET_CORNER
+        self._ticks = max((ticks for ticks in _QUIET_ROW_TICKS if highest_hz * ticks < TICK_RATE_HZ), default=0)
+        self._kept: dict[Any, tuple[dict[str, np.ndarray], MotionStart | None]] = {}
+
+    def predict(self, experiment: Experiment, parts: dict[str, Measured], key: Any) -> Prediction | None:
+        """Return the prediction, with the truth of the later samples only; None if it needs a single run.
+
+        Args:
+            experiment: Experiment, as `simplify` returns it.
+            parts: The channels on the clock of the model.
+            key: What determines the quiet samples; equal keys have equal ones.
+        """
+        early = {name: part.select_first(self._rows[name]) for name, part in parts.items()}
+        late = {name: part.select_rows(slice(self._rows[name], None)) for name, part in parts.items()}
+        has_both = all(len(part.times_s) for part in (*early.values(), *late.values()))
+        if experiment.begin is None or not self._ticks or not has_both:
+            return None
+        if key not in self._kept:
+            if len(self._kept) == _MAX_LEAD_INS:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = self._predict_early(experiment, early, late)
+        values, begin = self._kept[key]
+        if begin is None:
+            return None
+        found = predict(replace(experiment, begin=begin), late)
+        return replace(found, values={name: np.concatenate([values[name], found.values[name]]) for name in values})
+
+    def _predict_early(
+        self, experiment: Experiment, early: dict[str, Measured], late: dict[str, Measured]
+    ) -> tuple[dict[str, np.ndarray], MotionStart | None]:
+        """Return the quiet samples, and a start from which the later ones are settled, if both are possible."""
+        start_s = min(float(part.times_s[0]) for part in late.values()) - _settling_s(late)
+        tick = math.floor(start_s * TICK_RATE_HZ / _QUIET_GRID_TICKS) * _QUIET_GRID_TICKS
+        if experiment.begin is None or tick < experiment.begin.tick:
+            return {}, None
+        scene = experiment.scene
+        sensors = scene.sensors.model_copy(update={"rate_hz": TICK_RATE_HZ // self._ticks})
+        end_s = last_needed_s(early) + (_POLYNOMIAL_ROWS + 1) * self._ticks / TICK_RATE_HZ
+        scene = scene.model_copy(update={"sensors": sensors, "duration_s": end_s})
+        found = predict(replace(experiment, scene=scene), early)
+        row = (tick - experiment.begin.tick) * found.truth_rate_hz // TICK_RATE_HZ
+        begin = MotionStart(tick, state=tuple(found.truth["state"][row].tolist())) if not found.contacts else None
+        return found.values, begin
 
 
 def simplify(experiment: Experiment) -> Experiment:
@@ -532,7 +600,7 @@ def simplify(experiment: Experiment) -> Experiment:
         {
             "engine.companion": False,
             "engine.limits": {},
-            "engine.tolerance": experiment.scene.engine.tolerance,
+            "engine.tolerance": min(experiment.scene.engine.tolerance, _LOG_TOLERANCE if experiment.imported else 1.0),
             "sensors.groups": [fewest.name],
             "sensors.chain": "ideal",
             "sensors.rate_hz": TICK_RATE_HZ // (min(row_ticks, _LOG_ROW_TICKS) if experiment.imported else row_ticks),

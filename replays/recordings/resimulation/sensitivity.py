@@ -18,7 +18,15 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import LeadIns, Measured, Prediction, last_needed_s, predict, simplify
+from replays.recordings.resimulation.prediction import (
+    LeadIns,
+    Measured,
+    Prediction,
+    QuietStretch,
+    last_needed_s,
+    predict,
+    simplify,
+)
 from rig.base.errors import InputError, SimulationError
 from rig.channels.sampling import ROW_TICKS
 from rig.physics.model import build_model
@@ -51,6 +59,8 @@ _MARGIN_S = 1e-4
 """Simulated time after the last row, which may lie between two rows of the model."""
 _ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
 _COMMAND_KEY = re.compile(rf"({'|'.join(MECHANICAL)})\.([1-9][0-9]*)\.(\w+)")
+_LATER_KEYS = (*(f"{kind}." for kind in MECHANICAL), "contact.")
+"""Starts of keys without effect before the first command and contact."""
 _TICK_S = 1.0 / TICK_RATE_HZ
 _STEPS = {"at_s": 2.0 * _TICK_S, "duration_ms": 2e3 * _TICK_S}
 """Steps of difference quotients in quantities that a simulation rounds to ticks, by field of a command, in its unit.
@@ -197,7 +207,17 @@ class Predictor:
         parts: Mapping[str, Measured],
         *,
         about_s: float | None = None,
+        quiet_until_s: float = -math.inf,
     ) -> None:
+        """Set up the predictions.
+
+        Args:
+            experiment: Experiment of the recording.
+            keys: Keys of the values.
+            parts: Channels and rows to predict, by group.
+            about_s: Time at which the clocks differ by the offset alone [s]; None: the first sample.
+            quiet_until_s: Time before the first command up to which rows may be further apart [s].
+        """
         self.keys = tuple(keys)
         self.parts = dict(parts)
         self.start = np.array([get_value(experiment, key) for key in self.keys])
@@ -209,6 +229,7 @@ class Predictor:
         self._experiment = simplify(experiment)
         self._cache: dict[tuple[float, ...], Prediction] = {}
         self._lead_ins = LeadIns()
+        self._quiet = QuietStretch(self.parts, quiet_until_s) if math.isfinite(quiet_until_s) else None
 
     def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
         """Return the channels at some values, shape (keys,).
@@ -314,6 +335,10 @@ class Predictor:
         changed = with_values(self._experiment, {**values, "duration_s": end_s})
         if late := self._find_lateness(values):
             parts = {name: replace(part, times_s=part.times_s - late(part.times_s)) for name, part in parts.items()}
+        if self._quiet is not None and SCAN not in values:
+            earlier = tuple(item for item in values.items() if not item[0].startswith(_LATER_KEYS))
+            if (found := self._quiet.predict(changed, parts, earlier)) is not None:
+                return found
         found = predict(changed, parts, lead_ins=self._lead_ins)
         if SCAN not in values:
             return found

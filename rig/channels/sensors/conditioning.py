@@ -309,6 +309,12 @@ class Conditioner:
         """Column of each channel's signal, in the rows or after them, shape (channels,)."""
         return self._columns
 
+    def start_at(self, row: int) -> int:
+        """Start at this row instead of row 0; return the number of the first sample from then on."""
+        first = -(-row * self._parts // self._apart)
+        self._late = first * self._apart - row * self._parts
+        return first
+
     def twin(self, channels: Mapping[str, Channel], *, rate_hz: int, first: int, row: int, columns: int) -> Conditioner:
         """Return another chain of some of the channels, which continues from the state of this one.
 
