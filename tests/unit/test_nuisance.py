@@ -252,16 +252,15 @@ def test_a_gain_error_changes_the_fit_of_a_log_as_its_budget_predicts(
 ) -> None:
     rules = load_criteria().imported
     tuned = tune_few_channels(tmp_path / "right", motion)
-    times = 5.0  # so that the fit, which ends within a tenth of the noise, shows it
-    wrong = tune_few_channels(tmp_path / "wrong", motion, outer_y=1.0 + times * rules.calibration)
+    wrong = tune_few_channels(tmp_path / "wrong", motion, outer_y=1.0 + rules.calibration)
     compared = 0
     for budget in make_fit_budgets(tuned, rules):
         expected = budget.by_gain["outer_y"]
-        if abs(expected) > 0.1 * budget.contributions["noise"]:
+        if abs(expected) > 0.3 * budget.contributions["noise"]:  # the fit ends within a tenth
             moved = wrong.values[budget.name] - tuned.values[budget.name]
-            assert moved == pytest.approx(times * expected, rel=0.3), budget.name
+            assert moved == pytest.approx(expected, rel=0.3), budget.name
             compared += 1
-    assert compared >= 10
+    assert compared >= 8
 
 
 @MATRIX
