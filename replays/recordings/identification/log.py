@@ -94,7 +94,7 @@ def identify_log(
         z, residuals = moved_z, moved_residuals
     scale = np.array([unknown.scale for unknown in question.unknowns])
     places = [list(tuned.values).index(key) for key in question.keys]
-    moves = 1.96 * np.sqrt(np.mean(tuned.moves[:, places] ** 2, axis=0)) / scale
+    moves = 1.96 * np.sqrt(np.mean(tuned.growths[:, places] ** 2, axis=0)) / scale
     here = ChannelState(list(np.nan_to_num(residuals).T), list(np.moveaxis(slopes, 1, 0)))
     times = [window.question.observation.times_s[: len(residuals)]] * len(here.apart)
     first_s = first_command_s(question.experiment)

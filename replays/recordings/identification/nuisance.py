@@ -166,6 +166,7 @@ class Tuned:
         covariance: Covariance of the values, shape (values, values).
         moves: Changes of the values at the last growths of the window, shape (growths, values); they represent the
             error of the model.
+        growths: The same if the parts of a growth that was divided count as one, as each may be small.
         about_s: Time at which the clocks differ by the offset alone [s].
         end_s: End of the samples of the fit [s].
         longest_s: End of the samples if the model had explained all of them [s].
@@ -181,6 +182,7 @@ class Tuned:
     values: dict[str, float]
     covariance: np.ndarray
     moves: np.ndarray
+    growths: np.ndarray
     about_s: float
     end_s: float
     longest_s: float
@@ -402,6 +404,7 @@ def tune(
         values=fitted,
         covariance=fit.covariance,
         moves=fit.moves,
+        growths=fit.growths,
         about_s=min(float(part.times_s[0]) for part in whole.values()),
         end_s=fit.end_s,
         longest_s=end_s,
@@ -422,7 +425,7 @@ def _with_spectra(
 ) -> dict[str, Measured]:
     """Return parts with the spectra of their noise, from all samples of a log before an end [s].
 
-    What the model shows, with the given values of the experiment, is not noise.
+    Differences from the model with the given values of the experiment count as noise.
     """
     if not experiment.imported:
         return parts  # the noise of the rig itself is white
@@ -461,6 +464,7 @@ class _WindowFit:
         values: Fitted values, shape (keys,).
         covariance: Covariance of the values, shape (keys, keys).
         moves: Changes at the last growths of the window, shape (growths, keys).
+        growths: The same if the parts of a divided growth count as one.
         end_s: End of the window [s].
         scales: Residual rms over noise of each channel, at least 1.
         jackknife: Half of 95 % intervals by a jackknife, shape (keys,).
@@ -470,6 +474,7 @@ class _WindowFit:
     values: np.ndarray
     covariance: np.ndarray
     moves: np.ndarray
+    growths: np.ndarray
     end_s: float
     scales: list[float]
     jackknife: np.ndarray
@@ -568,7 +573,8 @@ def _fit_windows(
     values = np.array([get_value(baseline, key) for key in wanted]) if start is None else start
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
     jackknife, rows, parted_s = np.zeros(len(values)), list[int](), math.inf
-    lengths, last_s, halvings = list(_WINDOWS_S), 0.0, 0
+    lengths, last_s, halvings, undivided = list(_WINDOWS_S), 0.0, 0, 0.0
+    growths, grown = [values - values], values
     while lengths:
         length = lengths.pop(0)
         progress(f"{len(wanted)} values, to {first_s + length:.4f} s of {first_s + _WINDOWS_S[-1]:.3f} s")
@@ -598,6 +604,7 @@ def _fit_windows(
         if worse and not unseen and length - last_s > _MIN_GROWTH_S and halvings < _MAX_HALVINGS:
             halvings += 1
             lengths = [0.5 * (last_s + length), length, *lengths]  # the step was too long for a linear model
+            undivided = max(undivided, length)
             continue
         if scales and unseen and _is_worse(now, scales):
             fit, here, now = fitted(search_restarts(predictor, values, unseen, every))
@@ -608,11 +615,16 @@ def _fit_windows(
         scales, rows, last_s = now, [len(z) for z in here.apart], length
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
         moves.append(fit - values)
+        growths[-1] = fit - grown
+        if length >= undivided:
+            growths, grown = [*growths, fit - fit], fit
         covariance, values = np.linalg.inv(square + np.diag(priors[1] ** -2.0)), fit
         times = [part.times_s for part in parts.values() for _ in part.names]
         before = np.diag(priors[1] ** -2.0), np.zeros(len(values))
         end_s, jackknife = first_s + length, jackknife_half_widths(here, times, scales, before, first_s)
-    return _WindowFit(values, covariance, np.array(moves[-_COUNTED_GROWTHS:]), end_s, scales, jackknife, parted_s)
+    growths = [one for one in growths if one.any()][-_COUNTED_GROWTHS:] or growths
+    last = np.array(moves[-_COUNTED_GROWTHS:]), np.array(growths)
+    return _WindowFit(values, covariance, *last, end_s, scales, jackknife, parted_s)
 
 
 def _find_parting(

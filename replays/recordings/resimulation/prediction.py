@@ -38,7 +38,7 @@ _CHUNK_S = 0.1
 _LOG_ROW_TICKS = 10
 """Largest row spacing for a log [ticks]: an impact contains frequencies above half of the rig's own row rate, which the
 filters of a log never had to pass."""
-_LOG_TOLERANCE = 1e-6
+_LOG_TOLERANCE = 1e-8
 """Largest tolerance of the engine for a log: later impacts amplify the error of a tolerance of 3e-4 to hundreds of
 noises, and a run of some impacts takes no longer with this one."""
 _POLYNOMIAL_ROWS = 3
@@ -537,7 +537,7 @@ def _settling_s(parts: Mapping[str, Measured]) -> float:
 class QuietStretch:
     """Prediction with rows further apart before the first contact, kept for experiments that differ only later.
 
-    Without a contact, an engine's motion is exact at any row spacing.
+    Without a contact, the motion of the default engine is exact at any row spacing.
     """
 
     def __init__(self, parts: Mapping[str, Measured], until_s: float) -> None:
