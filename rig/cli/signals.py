@@ -14,6 +14,8 @@ _ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 """SIGHUP only if it is not ignored, as under nohup."""
 _AGAIN_S = 0.02
 """Time until a swallowed interrupt is sent again [s]: the callback has returned."""
+_STOPPING_S = 1.0
+"""Longest time to wait for `stop` to return after the command has ended [s]."""
 _received: list[int] = []
 """Signals received before a handler was set; the code that the exception interrupts may swallow it."""
 
@@ -87,4 +89,4 @@ def stop_on_signals(stop: Callable[[], object]) -> Iterator[None]:
             # While the command ends, only a second SIGINT has an effect.
             signal.signal(number, signal.SIG_IGN if ended and number != signal.SIGINT else handler)
         received.put(None)
-        stopper.join()
+        stopper.join(_STOPPING_S)

@@ -122,11 +122,32 @@ def test_a_quiet_stretch_is_predicted_apart_where_it_can_be(own: dict[str, Any],
             assert np.abs(value - other.values[name]).max() < 1e-5 * np.ptp(value)
 
 
-def test_no_quiet_stretch_ends_after_a_contact() -> None:
-    rows = make_rows(("disk_x",), np.arange(6200, 19_000) / 20_000)
-    for until_s in (0.9, 1.2):
-        single, late = (Predictor(running(), (), rows, quiet_until_s=one).predict(()) for one in (-np.inf, until_s))
-        assert single.values["disk_x"].tobytes() == late.values["disk_x"].tobytes()
+SPEED = {"at_s": 0.6, "command": "speed", "speed_hz": 4.5}
+
+
+@pytest.mark.parametrize(
+    ("changes", "until_s", "version"),
+    [({}, 0.9, 2), ({}, 1.2, 2), ({}, 0.82, 1), ({"commands": [SPEED]}, 0.82, 2)],
+    ids=["after the pulse", "after all rows", "version 1", "after a command"],
+)
+def test_no_quiet_stretch_is_predicted_apart_where_it_cannot_be(
+    changes: dict[str, Any], until_s: float, version: int
+) -> None:
+    rows = make_rows(("disk_x",), np.arange(6200, 19_000) / 20_000, bandwidth_hz=5000.0, highpass_hz=0.0)
+    rows = {name: replace(part, version=version) for name, part in rows.items()}
+    single, late = (Predictor(running(**changes), (), rows, quiet_until_s=one) for one in (-np.inf, until_s))
+    assert single.predict(()).values["disk_x"].tobytes() == late.predict(()).values["disk_x"].tobytes()
+
+
+@pytest.mark.parametrize("truth_rate_hz", [50, 250, 1250, 2000])
+def test_a_quiet_stretch_may_end_in_a_gap_and_needs_no_rate_of_the_truth(truth_rate_hz: int) -> None:
+    index = np.concatenate([np.arange(6200, 15_000), np.arange(16_500, 17_400)])
+    rows = make_rows(("disk_x", "inner_x"), index / 20_000, bandwidth_hz=5000.0, highpass_hz=0.0)
+    running_rig = running(**{"sensors.truth_rate_hz": truth_rate_hz})
+    single, apart = (Predictor(running_rig, (), rows, quiet_until_s=one).predict(()) for one in (-np.inf, 0.82))
+    assert len(apart.truth["state"]) < len(single.truth["state"])
+    for name, value in single.values.items():
+        assert np.abs(value - apart.values[name]).max() < 1e-5 * np.ptp(value)
 
 
 def test_the_prediction_of_a_log_is_accurate_after_many_impacts() -> None:

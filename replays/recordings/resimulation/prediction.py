@@ -545,6 +545,8 @@ class QuietStretch:
         self._rows = {name: part.count_rows(until_s) for name, part in parts.items()}
         corners = [c.bandwidth_hz for part in parts.values() for c in part.channels if not math.isinf(c.bandwidth_hz)]
         highest_hz = max(corners, default=0.0) / _MAX_QUIET_CORNER
+        if any(part.version < 2 for part in parts.values()):
+            highest_hz = math.inf  # filters of version 1 depend on the rate of the rows
         self._ticks = max((ticks for ticks in _QUIET_ROW_TICKS if highest_hz * ticks < TICK_RATE_HZ), default=0)
         self._kept: dict[Any, tuple[dict[str, np.ndarray], MotionStart | None]] = {}
 
@@ -559,7 +561,11 @@ class QuietStretch:
         early = {name: part.select_first(self._rows[name]) for name, part in parts.items()}
         late = {name: part.select_rows(slice(self._rows[name], None)) for name, part in parts.items()}
         has_both = all(len(part.times_s) for part in (*early.values(), *late.values()))
+        commanded_s = [command.at_s for command in experiment.scene.commands]
+        commanded_s += [command.tick / TICK_RATE_HZ for command in experiment.commands]
         if experiment.begin is None or not self._ticks or not has_both:
+            return None
+        if self._find_end(early) > min(commanded_s, default=math.inf):
             return None
         if key not in self._kept:
             if len(self._kept) == _MAX_LEAD_INS:
@@ -571,18 +577,23 @@ class QuietStretch:
         found = predict(replace(experiment, begin=begin), late)
         return replace(found, values={name: np.concatenate([values[name], found.values[name]]) for name in values})
 
+    def _find_end(self, early: dict[str, Measured]) -> float:
+        """Return the end of the run that shows the quiet samples [s]."""
+        return last_needed_s(early) + (_POLYNOMIAL_ROWS + 1) * self._ticks / TICK_RATE_HZ
+
     def _predict_early(
         self, experiment: Experiment, early: dict[str, Measured], late: dict[str, Measured]
     ) -> tuple[dict[str, np.ndarray], MotionStart | None]:
         """Return the quiet samples, and a start from which the later ones are settled, if both are possible."""
-        start_s = min(float(part.times_s[0]) for part in late.values()) - _settling_s(late)
-        tick = math.floor(start_s * TICK_RATE_HZ / _QUIET_GRID_TICKS) * _QUIET_GRID_TICKS
+        settled_s = min(float(part.times_s[0]) for part in late.values())
+        start_s = min(settled_s - _settling_s(late), last_needed_s(early))  # there may be a gap between them
+        grid = math.lcm(_QUIET_GRID_TICKS, TICK_RATE_HZ // experiment.scene.sensors.truth_rate_hz)
+        tick = math.floor(start_s * TICK_RATE_HZ / grid) * grid
         if experiment.begin is None or tick < experiment.begin.tick:
             return {}, None
         scene = experiment.scene
         sensors = scene.sensors.model_copy(update={"rate_hz": TICK_RATE_HZ // self._ticks})
-        end_s = last_needed_s(early) + (_POLYNOMIAL_ROWS + 1) * self._ticks / TICK_RATE_HZ
-        scene = scene.model_copy(update={"sensors": sensors, "duration_s": end_s})
+        scene = scene.model_copy(update={"sensors": sensors, "duration_s": self._find_end(early)})
         found = predict(replace(experiment, scene=scene), early)
         row = (tick - experiment.begin.tick) * found.truth_rate_hz // TICK_RATE_HZ
         begin = MotionStart(tick, state=tuple(found.truth["state"][row].tolist())) if not found.contacts else None
