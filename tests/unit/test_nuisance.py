@@ -256,11 +256,11 @@ def test_a_gain_error_changes_the_fit_of_a_log_as_its_budget_predicts(
     compared = 0
     for budget in make_fit_budgets(tuned, rules):
         expected = budget.by_gain["outer_y"]
-        if abs(expected) > 0.3 * budget.contributions["noise"]:  # the fit ends within a tenth
+        if abs(expected) > 0.1 * budget.contributions["noise"]:
             moved = wrong.values[budget.name] - tuned.values[budget.name]
             assert moved == pytest.approx(expected, rel=0.3), budget.name
             compared += 1
-    assert compared >= 8
+    assert compared >= 10
 
 
 @MATRIX

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from rig.run.offline import frames
 from rig.run.scenes import Scene, rig_table
 from rig.run.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
 
+K = TypeVar("K")
+V = TypeVar("V")
 _ADC_BITS = 32
 """Word length of a predicted channel's converter, whose rounding is then negligible."""
 _RANGE_MARGIN = 16.0
@@ -404,6 +406,21 @@ def _channels(
     ]
 
 
+def keep_recent(kept: dict[K, V], key: K, most: int, make: Callable[[], V]) -> V:
+    """Return the value of a key; a new one is made, and replaces the oldest if there are as many as may be kept."""
+    if key not in kept:
+        if len(kept) >= most:
+            kept.pop(next(iter(kept)))
+        kept[key] = make()
+    return kept[key]
+
+
+def _command_ticks(experiment: Experiment) -> list[int]:
+    """Return the ticks of all commands of an experiment, those of its scene and those that were sent."""
+    timed = [round(command.at_s * TICK_RATE_HZ) for command in experiment.scene.commands]
+    return timed + [command.tick for command in experiment.commands]
+
+
 class LeadIns:
     """Cache of simulations up to the first samples or the first command, for experiments that differ only later.
 
@@ -421,17 +438,15 @@ class LeadIns:
         Returns:
             The truth up to there, by table.
         """
-        ticks = [round(command.at_s * TICK_RATE_HZ) for command in experiment.scene.commands]
-        until = min([until, *ticks, *(command.tick for command in experiment.commands)])
+        until = min([until, *_command_ticks(experiment)])
         if until < simulation.tick + chunk_s * TICK_RATE_HZ:
             return {}
         alone = experiment.scene.model_copy(update={"commands": ()})
         key = (alone.model_dump_json(), experiment.begin, chunk_s, until)
-        if key not in self._kept:
-            if len(self._kept) == _MAX_LEAD_INS:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = _lead_in(Simulation(alone, begin=experiment.begin), chunk_s=chunk_s, until=until)
-        snapshot, truth = self._kept[key]
+        snapshot, truth = keep_recent(
+            self._kept, key, _MAX_LEAD_INS,
+            lambda: _lead_in(Simulation(alone, begin=experiment.begin), chunk_s=chunk_s, until=until),
+        )  # fmt: skip
         simulation.restore(snapshot)
         return {name: list(blocks) for name, blocks in truth.items()}
 
@@ -561,17 +576,13 @@ class QuietStretch:
         early = {name: part.select_first(self._rows[name]) for name, part in parts.items()}
         late = {name: part.select_rows(slice(self._rows[name], None)) for name, part in parts.items()}
         has_both = all(len(part.times_s) for part in (*early.values(), *late.values()))
-        commanded_s = [command.at_s for command in experiment.scene.commands]
-        commanded_s += [command.tick / TICK_RATE_HZ for command in experiment.commands]
         if experiment.begin is None or not self._ticks or not has_both:
             return None
-        if self._find_end(early) > min(commanded_s, default=math.inf):
+        if self._find_end(early) * TICK_RATE_HZ > min(_command_ticks(experiment), default=math.inf):
             return None
-        if key not in self._kept:
-            if len(self._kept) == _MAX_LEAD_INS:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._predict_early(experiment, early, late)
-        values, begin = self._kept[key]
+        values, begin = keep_recent(
+            self._kept, key, _MAX_LEAD_INS, lambda: self._predict_early(experiment, early, late)
+        )  # fmt: skip
         if begin is None:
             return None
         found = predict(replace(experiment, begin=begin), late)

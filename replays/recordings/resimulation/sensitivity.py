@@ -23,6 +23,7 @@ from replays.recordings.resimulation.prediction import (
     Measured,
     Prediction,
     QuietStretch,
+    keep_recent,
     last_needed_s,
     predict,
     simplify,
@@ -53,7 +54,7 @@ _STEP = 1e-5
 """Step of a difference quotient, relative to the value's scale."""
 _MIN_STEP = 1e-8
 """Smallest step, to which it is shortened while the contacts on the two sides differ."""
-_MAX_CACHED = 8
+_MAX_CACHED = 9
 """Predictions kept."""
 _MARGIN_S = 1e-4
 """Simulated time after the last row, which may lie between two rows of the model."""
@@ -246,11 +247,9 @@ class Predictor:
                 below = math.floor(value / _TICK_S + 1e-3)
                 if value - below * _TICK_S > 1e-3 * _TICK_S:
                     return self._interpolate_command(values, place, below)
-        if values not in self._cache:
-            if len(self._cache) > _MAX_CACHED:
-                self._cache.pop(next(iter(self._cache)))
-            self._cache[values] = self._run(dict(zip(self.keys, values, strict=True)))
-        return self._cache[values]
+        return keep_recent(
+            self._cache, values, _MAX_CACHED, lambda: self._run(dict(zip(self.keys, values, strict=True)))
+        )
 
     def derivatives(self, values: Sequence[float] | np.ndarray) -> Derivatives:
         """Return the derivatives by central differences, one-sided at the limits of the model.
