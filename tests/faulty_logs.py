@@ -332,7 +332,9 @@ def draw_fault(kind: str, rng: np.random.Generator, motion: Motion, rows: int, h
             "two", f"(?=.*{a.case.pattern})(?=.*{b.case.pattern})",
             analog=lambda values, hz: b.case.signals(a.case.signals(values, motion), motion),
         )  # fmt: skip
-        return Drawn(both, a.channels + b.channels, f"{a.size}; {b.size}", min(a.over_noise, b.over_noise), a.kin)
+        return Drawn(
+            both, a.channels + b.channels, f"{a.size}; {b.size}", min(a.over_noise, b.over_noise), f"({a.kin}|{b.kin})"
+        )
     names = (*PROBES, *FORCES, *HOUSINGS)
     name = str(rng.choice(FORCES if kind in ("AC coupling", "clip") else HOUSINGS if kind == "wrap" else names))
     first = round(hit_s * motion.rate_hz)

@@ -10,7 +10,7 @@ import pytest
 
 from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.validation.criteria import load_criteria
-from replays.recordings.validation.explanations.attribution import conclude
+from replays.recordings.validation.explanations.attribution import Explained, conclude, settle_channels
 from replays.recordings.validation.explanations.channel_fit import Shown
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import diagnose
@@ -218,3 +218,24 @@ def test_a_single_probe_at_another_angle_is_no_crosstalk(degrees: float, words: 
     assert found.change == f"{abs(degrees):g} degrees {words} disk_y"
     found = name_single(show("disk_x", SECOND_PROBE, SECOND_PROBE + math.sin(angle) * PROBE, 4e-4))
     assert found.name == "disk_x crosstalk"
+
+
+def test_a_small_difference_beside_a_fault_is_another_fault_if_it_remains_without_the_faulty_channel() -> None:
+    gain = name_single(show("P_S", FORCE, 0.99 * FORCE, 1.0))
+    offset = name_single(show("inner_x", PROBE, PROBE - 0.1, 0.1))
+    explained = Explained(0.0, 1.0, (gain,), "sensor: P_S gain -1 %", (gain.name,), ("inner_x",))
+    used = list[list[str]]()
+
+    def find_faults(channels: list[str], left: tuple[Explanation, ...]) -> list[Explanation]:
+        used.append(channels)
+        return [*left]
+
+    def conclusion(*left: Explanation) -> str:
+        told = settle_channels(explained, ["disk_x", "P_S", "inner_x"], lambda channels: find_faults(channels, left))
+        return told.conclusion.partition("; ")[2]
+
+    assert conclusion(offset).startswith(
+        "inner_x differs also without P_S: another fault, closest is inner_x offset -0."
+    )
+    assert conclusion() == "inner_x is as predicted without P_S: its small difference is an effect of the fault"
+    assert used == [["disk_x", "inner_x"]] * 2

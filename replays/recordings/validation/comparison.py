@@ -27,10 +27,15 @@ from replays.recordings.validation.explanations.attribution import (
     attribute,
     explain_by_defects,
     explain_log,
+    settle_channels,
 )
 from replays.recordings.validation.explanations.budget import Budget, make_fit_budgets, make_quantity_budgets
 from replays.recordings.validation.explanations.explanation import Explanation
-from replays.recordings.validation.explanations.faults import find_common_delay, select_channels
+from replays.recordings.validation.explanations.faults import (
+    find_common_delay,
+    select_channels,
+    sensor_faults,
+)
 from replays.recordings.validation.explanations.model_parameters import find_changes
 from replays.recordings.validation.explanations.signals import (
     SignalFault,
@@ -51,7 +56,7 @@ from replays.recordings.validation.trajectory import (
     scaled,
     tolerate,
 )
-from replays.recordings.validation.truth import find_contradictions, judge_truth, recorded_truth
+from replays.recordings.validation.truth import TruthTables, find_contradictions, judge_truth, recorded_truth
 from rig.base.errors import InputError, Words
 from rig.base.wire import TRUTH
 
@@ -165,8 +170,9 @@ def validate(
         return replace(validation, explained=attribute(
             again.quick, again.parts, again.nominal, rules, from_s=min(firsts), own=again.own, step=step
         ))  # fmt: skip
+    resimulate = partial(_resimulate_log, recording)
     explain = partial(_explain_log, from_s=min(firsts), touching=touching)
-    explained = _explain_by_times(again, end, partial(_resimulate_log, recording, experiment, criteria, step), explain)
+    explained = _explain_with_refits(again, end, partial(resimulate, experiment, criteria, step), explain)
     named = [one for one in explained.ranked if one.kind == "model" and one.name in explained.best][:_MAX_CHECKED]
     if named and any(one.good is False for one in judged):
         # A change that removes the first part may only be the closest one.
@@ -174,9 +180,7 @@ def validate(
         for one in named:
             step(f"the same with {one.name} {one.change}")
             changed = with_values(experiment, find_changes(experiment, criteria.attribution, one))
-            other = _resimulate_log(recording, changed, criteria, step)
-            _, held = statistics(other.quick, other.parts, other.nominal, tables, other.criteria, other.members)
-            off.append(sum(result.good is False for result in held))
+            off.append(_count_failures(resimulate(changed, criteria, step), tables))
         if min(off) > 0:
             text = f"closest is {explained.conclusion}; but {min(off)} of {len(judged)} quantities are still off"
             text += ": another number, or several at once; `rig identify` fits them"
@@ -352,16 +356,30 @@ def _resimulate_log(
     step: Callable[[str], None],
     late_s: dict[str, float] | None = None,
     more: tuple[str, ...] = (),
+    channels: Sequence[str] | None = None,
 ) -> _Resimulation:
-    """Return the re-simulation of a log: unknown numbers are fitted, and their uncertainty is added to the floor."""
+    """Return the re-simulation of a log: unknown numbers are fitted, and their uncertainty is added to the floor.
+
+    Args:
+        recording: The log.
+        experiment: Experiment, as far as it is known.
+        criteria: Criteria.
+        step: Function that is called with the current step.
+        late_s: Assumed delay of some channels [s].
+        more: Keys to fit in addition.
+        channels: Channels to use; None for all.
+    """
     rules, longest_s = criteria.imported, criteria.window.longest_s
 
     tuned = tune(
         recording, experiment, (*rules.nuisances, *more), priors=dict.fromkeys(criteria.floating), late_s=late_s,
-        variants=[variant.set for variant in rules.variants], progress=lambda text: step(f"log: {text}"),
+        channels=channels, variants=[variant.set for variant in rules.variants],
+        progress=lambda text: step(f"log: {text}"),
     )  # fmt: skip
     models = [tuned, *(tuned.with_changes(variant.set) for variant in rules.variants)]
     whole = read_measured(recording, tuned.baseline.scene)
+    if channels is not None:
+        whole = {name: part.select_channels(channels) for name, part in whole.items() if {*part.names} & {*channels}}
     begin_s = window_start_s(tuned.baseline)
     parts = {
         name: part.select_until(float(part.times_s[0]) + longest_s).select_from(begin_s) for name, part in whole.items()
@@ -434,25 +452,47 @@ def _explain_log(again: _Resimulation, *, from_s: float, end_s: float, touching:
     )  # fmt: skip
 
 
-def _explain_by_times(
+def _count_failures(again: _Resimulation, tables: TruthTables) -> int:
+    """Return the number of statistics that fail."""
+    _, judged = statistics(again.quick, again.parts, again.nominal, tables, again.criteria, again.members)
+    return sum(one.good is False for one in judged)
+
+
+def _explain_with_refits(
     again: _Resimulation,
     end_s: float,
     resimulate: Callable[..., _Resimulation],
     explain: Callable[..., Explained],
 ) -> Explained:
-    """Return the explanation of a log, after a further fit if channels seem late: of a kind together, or in turn."""
-    assert again.tuned is not None
+    """Return the explanation of a log.
+
+    A further fit is made if channels seem late, of a kind together or in turn, and one if small differences may be an
+    effect of the channels that are named.
+    """
     explained = explain(again, end_s=end_s)
+    assert again.tuned is not None
     if late_s := find_common_delay(explained.ranked, again.parts):
         other = resimulate(late_s=late_s)
         if other.tuned is not None and other.tuned.is_better_than(again.tuned):
-            return explain(other, end_s=min(end_s, other.tuned.end_s))
+            again, end_s, resimulate = other, min(end_s, other.tuned.end_s), partial(resimulate, late_s=late_s)
+            explained = explain(again, end_s=end_s)
     elif again.tuned.end_s < again.tuned.longest_s and any("delay" in one.name for one in explained.ranked):
         other = resimulate(more=(SCAN,))
         sizes = [abs(one.value) / one.half_width for one in other.fitted if one.key == SCAN]
         if other.tuned is not None and other.tuned.end_s > again.tuned.end_s and min(sizes) > _MIN_SCAN_RATIO:
-            return explain(other, end_s=other.tuned.end_s)
-    return explained
+            again, end_s, resimulate = other, other.tuned.end_s, partial(resimulate, more=(SCAN,))
+            explained = explain(again, end_s=end_s)
+    assert again.tuned is not None
+    return settle_channels(explained, [*again.tuned.scales], partial(_find_other_faults, end_s, resimulate))
+
+
+def _find_other_faults(
+    end_s: float, resimulate: Callable[..., _Resimulation], channels: list[str]
+) -> list[Explanation]:
+    """Return the faults of channels if the fit uses these only."""
+    other = resimulate(channels=channels)
+    assert other.tuned is not None
+    return sensor_faults(other.parts, other.nominal, min(end_s, other.tuned.end_s), other.others)
 
 
 def find_assumed_corners(recording: Recording) -> dict[str, float]:

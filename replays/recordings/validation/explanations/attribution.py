@@ -78,6 +78,7 @@ class Explained:
         ranked: Explanations, best first.
         conclusion: Conclusion in a sentence.
         best: Names of the explanations in the conclusion.
+        unsettled: Channels whose small differences are an effect of the faults in the conclusion, or other faults.
     """
 
     from_s: float
@@ -85,6 +86,7 @@ class Explained:
     ranked: tuple[Explanation, ...]
     conclusion: str
     best: tuple[str, ...]
+    unsettled: tuple[str, ...] = ()
 
 
 def attribute(
@@ -217,8 +219,7 @@ def explain_log(
     numbers = [one for one in numbers if one not in small]
     told_s = min((one.to_s for one in numbers), default=end_s)
     conclusion, best = conclude([*sensors, *numbers], sensors if cured else [], rules, end_s=told_s)
-    if brought and cured:
-        conclusion += f"; {_join(select_channels(brought, tuned.scales))} in addition: an effect, or another fault"
+    unsettled = tuple(select_channels(brought, tuned.scales)) if cured else ()
     early = next((one.value for one in sensors if one.name == "hammer delay" and one.value < 0.0), None)
     probes = [name for name in tuned.scales if name in default_table().groups["probes"].names]
     if early is not None and best and len(probes) > 1:
@@ -256,8 +257,32 @@ def explain_log(
         else:
             conclusion += "; `rig identify` fits its numbers"
     return Explained(
-        from_s, end_s, tuple(sorted([*sensors, *numbers], key=lambda one: -one.explained)), conclusion, best
+        from_s, end_s, tuple(sorted([*sensors, *numbers], key=lambda one: -one.explained)), conclusion, best, unsettled
     )
+
+
+def settle_channels(
+    explained: Explained, channels: list[str], find_faults: Callable[[list[str]], list[Explanation]]
+) -> Explained:
+    """Return the explanation of a log with a word on its unsettled channels: another fault, or an effect of the first.
+
+    Args:
+        explained: The explanation.
+        channels: Channels of the fit.
+        find_faults: Function that returns the faults of some channels if the fit uses these only.
+    """
+    known = select_channels([one for one in explained.ranked if one.name in explained.best], channels)
+    if not (explained.unsettled and known):
+        return explained
+    left = find_faults([name for name in channels if name not in known])
+    conclusion, without = explained.conclusion, f"without {_join(known)}"
+    for name in explained.unsettled:
+        found = next((one for one in left if select_channels([one], [name])), None)
+        if found is None:
+            conclusion += f"; {name} is as predicted {without}: its small difference is an effect of the fault"
+        else:
+            conclusion += f"; {name} differs also {without}: another fault, closest is {found.name} {found.change}"
+    return replace(explained, conclusion=conclusion, unsettled=())
 
 
 def _find_size(experiment: Experiment, one: Explanation, rules: Attribution) -> float:
