@@ -23,6 +23,8 @@ import numpy as np
 from numba import njit
 
 STEP_S = 0.5e-6
+LEAD_STEP_S = 4e-6
+"""Step before the recorded part, which has no contact [s]."""
 _NAMES = ("disk_x", "disk_y", "ring_x", "ring_y", "P_N", "P_S", "P_E", "P_W", "inner_x", "inner_y", "outer_x",
           "outer_y", "speed", "keyphasor", "hammer")  # fmt: skip
 UNITS = dict(zip(_NAMES, ["mm"] * 4 + ["N"] * 4 + ["m/s^2"] * 4 + ["Hz", "1", "N"], strict=True))
@@ -145,8 +147,8 @@ def _step(rig, t, h, omega0, pulse, v0, y, work):
 
 
 @njit(cache=True)
-def _run(rig, y, omega0, pulse, t0, steps, every, rows):
-    work, h, v0, contacts, inside = np.empty((6, 15)), STEP_S, 0.0, 0, 0
+def _run(rig, y, omega0, pulse, t0, h, steps, every, rows):
+    work, v0, contacts, inside = np.empty((6, 15)), 0.0, 0, 0
     for n in range(steps):
         t, part = t0 + n * h, 0.0
         inputs = rows[n // every] if n % every == 0 else work[5]
@@ -232,9 +234,9 @@ def simulate_pulse(
     rows = np.empty((round((before_s + after_s) / STEP_S / every), len(_NAMES)))
     quiet = np.empty((1, len(_NAMES)))
     pulse = (before_s, duration_ms * 1e-3, force_n)
-    lead = round(settled_s / STEP_S)
-    _run(rig, y, omega, pulse, -settled_s, lead, lead + 1, quiet)
-    contacts = _run(rig, y, omega, pulse, 0.0, len(rows) * every, every, rows)
+    lead = round(settled_s / LEAD_STEP_S)
+    assert not _run(rig, y, omega, pulse, -settled_s, LEAD_STEP_S, lead, lead + 1, quiet)
+    contacts = _run(rig, y, omega, pulse, 0.0, STEP_S, len(rows) * every, every, rows)
     assert np.isfinite(rows).all()
     # Accelerations jump where friction changes its sign; differences of the speeds locate it between the rows.
     v = np.pad(rows[:, 8:12], ((2, 2), (0, 0)), mode="edge")

@@ -22,7 +22,7 @@ from replays.recordings.formats.conversion import convert, write_recording
 from replays.recordings.formats.mapping import load_mapping, parse_mapping
 from replays.recordings.identification.agreement import solve_weighted
 from replays.recordings.identification.log import identify_log
-from replays.recordings.identification.nuisance import NUISANCES, Tuned, find_nuisances, tune
+from replays.recordings.identification.nuisance import NUISANCES, Fitted, Tuned, find_nuisances, tune
 from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict, read_measured
 from replays.recordings.resimulation.sensitivity import ANGLE, PHASE, get_value, with_values
@@ -372,6 +372,16 @@ def test_a_clock_is_no_number_of_the_experiment(mils: Recording) -> None:
     turned = with_values(experiment, {ANGLE: 0.5, "drive.speed_hz": experiment.scene.drive.speed_hz + 0.01})
     assert get_value(turned, PHASE) == pytest.approx(get_value(experiment, PHASE))
     assert get_value(replace(turned, angle=0.0), PHASE) == pytest.approx(get_value(experiment, PHASE) + 0.5)
+
+
+def test_a_clock_that_the_samples_do_not_determine_is_no_cause() -> None:
+    """A wrong contact can move it to the limit of its prior, with an interval that contains 0 ppm."""
+    clock = Fitted("clock.rate_ppm", 0.0, 600.0, 30.0, (0.0, 50.0))
+    assert (clock.beyond, clock.contradicts_prior) == (True, True)
+    unknown = replace(clock, value=250.0, half_width=500.0)
+    assert (unknown.beyond, unknown.contradicts_prior) == (True, False)
+    sound = replace(clock, value=40.0)
+    assert (sound.beyond, sound.contradicts_prior) == (False, False)
 
 
 def import_marked_log(folder: Path, angle: str, phi: float = 0.21) -> Recording:

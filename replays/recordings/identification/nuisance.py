@@ -126,6 +126,11 @@ class Fitted:
         return self.key == SCAN or _is_beyond(self.value, self.prior)
 
     @property
+    def contradicts_prior(self) -> bool:
+        """True if the value is beyond its prior, and its interval does not contain the mean of the prior."""
+        return self.beyond and (self.prior is None or abs(self.value - self.prior[0]) > self.half_width)
+
+    @property
     def line(self) -> str:
         """The result in words."""
         if self.key == "clock.offset_s":

@@ -208,7 +208,7 @@ def explain_log(
     brought = [one for one in sensors if one.explained <= _MIN_SHARE * most]
     sensors = [one for one in sensors if one.explained > _MIN_SHARE * most]
     trigger = any(one.name == "hammer delay" for one in sensors)
-    far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
+    far = [one for one in tuned.fitted if one.contradicts_prior and not (trigger and one.key == "clock.offset_s")]
     # Different faults of more channels than `FEW_CHANNELS` are rather one error of the model.
     few = len(sensors) < FEW_CHANNELS * len(tuned.scales)
     cured = few and are_cause(sensors, parts)
