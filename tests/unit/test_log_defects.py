@@ -10,7 +10,7 @@ import pytest
 
 from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.validation.criteria import load_criteria
-from replays.recordings.validation.explanations.attribution import Explained, conclude, settle_channels
+from replays.recordings.validation.explanations.attribution import Explained, Rest, conclude, settle_channels
 from replays.recordings.validation.explanations.channel_fit import Shown
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import diagnose
@@ -220,22 +220,30 @@ def test_a_single_probe_at_another_angle_is_no_crosstalk(degrees: float, words: 
     assert found.name == "disk_x crosstalk"
 
 
-def test_a_small_difference_beside_a_fault_is_another_fault_if_it_remains_without_the_faulty_channel() -> None:
+def settle(*faults: Explanation, failed: str = "", passed: str = "", is_evidence: bool = True) -> Explained:
+    """Return the settled explanation of a log with a gain of P_S, an unsettled inner_x, and a failing outer_y."""
     gain = name_single(show("P_S", FORCE, 0.99 * FORCE, 1.0))
-    offset = name_single(show("inner_x", PROBE, PROBE - 0.1, 0.1))
     explained = Explained(0.0, 1.0, (gain,), "sensor: P_S gain -1 %", (gain.name,), ("inner_x",))
-    used = list[list[str]]()
+    channels = ["disk_x", "P_S", "inner_x", "outer_y"]
 
-    def find_faults(channels: list[str], left: tuple[Explanation, ...]) -> list[Explanation]:
-        used.append(channels)
-        return [*left]
+    def compare(used: list[str]) -> Rest:
+        assert used == ["disk_x", "inner_x", "outer_y"]
+        return Rest([*faults], failed.split(), is_evidence)
 
-    def conclusion(*left: Explanation) -> str:
-        told = settle_channels(explained, ["disk_x", "P_S", "inner_x"], lambda channels: find_faults(channels, left))
-        return told.conclusion.partition("; ")[2]
+    return settle_channels(explained, {name: name in passed for name in ("P_S", "outer_y")}, channels, compare)
 
-    assert conclusion(offset).startswith(
-        "inner_x differs also without P_S: another fault, closest is inner_x offset -0."
-    )
-    assert conclusion() == "inner_x is as predicted without P_S: its small difference is an effect of the fault"
-    assert used == [["disk_x", "inner_x"]] * 2
+
+def test_differences_beside_a_fault_are_settled_by_a_fit_without_the_faulty_channel() -> None:
+    offset = name_single(show("inner_x", PROBE, PROBE - 0.1, 0.1))
+    none = settle(passed="outer_y")
+    assert none.conclusion.endswith("; inner_x differs only through the fit: a fit without P_S shows no difference")
+    assert (none.settled, none.best) == ({"inner_x": "effect"}, ("P_S gain",))
+    small = settle(offset, failed="outer_y")
+    assert "; another fault, also in a fit without P_S, closest is inner_x offset -0." in small.conclusion
+    assert small.conclusion.endswith("; outer_y fails, also in a fit without P_S, without a known cause")
+    assert (small.settled, small.best) == ({"inner_x": "fault", "outer_y": "fault"}, ("P_S gain",))
+    failed = settle(offset, failed="inner_x")
+    assert (failed.settled["outer_y"], failed.best) == ("effect", ("P_S gain", "inner_x offset"))
+    unknown = settle(is_evidence=False)
+    assert unknown.conclusion.endswith("; inner_x and outer_y in addition: an effect, or another fault")
+    assert (unknown.settled, unknown.best) == ({}, ("P_S gain",))

@@ -24,6 +24,7 @@ from replays.recordings.validation.criteria import Criteria, load_criteria
 from replays.recordings.validation.explanations.attribution import (
     FEW_CHANNELS,
     Explained,
+    Rest,
     attribute,
     explain_by_defects,
     explain_log,
@@ -172,7 +173,8 @@ def validate(
         ))  # fmt: skip
     resimulate = partial(_resimulate_log, recording)
     explain = partial(_explain_log, from_s=min(firsts), touching=touching)
-    explained = _explain_with_refits(again, end, partial(resimulate, experiment, criteria, step), explain)
+    passed = {one.channel: one.good for one in trajectory if one.good is not None}
+    explained = _explain_with_refits(again, end, partial(resimulate, experiment, criteria, step), explain, passed)
     named = [one for one in explained.ranked if one.kind == "model" and one.name in explained.best][:_MAX_CHECKED]
     if named and any(one.good is False for one in judged):
         # A change that removes the first part may only be the closest one.
@@ -185,7 +187,6 @@ def validate(
             text = f"closest is {explained.conclusion}; but {min(off)} of {len(judged)} quantities are still off"
             text += ": another number, or several at once; `rig identify` fits them"
             explained = replace(explained, conclusion=text, best=())
-    passed = {one.channel: one.good for one in trajectory if one.good is not None}
     return replace(validation, explained=explain_assumed(explained, recording, passed))
 
 
@@ -463,11 +464,12 @@ def _explain_with_refits(
     end_s: float,
     resimulate: Callable[..., _Resimulation],
     explain: Callable[..., Explained],
+    passed: Mapping[str, bool],
 ) -> Explained:
     """Return the explanation of a log.
 
-    A further fit is made if channels seem late, of a kind together or in turn, and one if small differences may be an
-    effect of the channels that are named.
+    A further fit is made if channels seem late, of a kind together or in turn, and one without the channels that are
+    named if others differ, too.
     """
     explained = explain(again, end_s=end_s)
     assert again.tuned is not None
@@ -483,16 +485,17 @@ def _explain_with_refits(
             again, end_s, resimulate = other, other.tuned.end_s, partial(resimulate, more=(SCAN,))
             explained = explain(again, end_s=end_s)
     assert again.tuned is not None
-    return settle_channels(explained, [*again.tuned.scales], partial(_find_other_faults, end_s, resimulate))
+    return settle_channels(explained, passed, [*again.tuned.scales], partial(_compare_rest, end_s, resimulate))
 
 
-def _find_other_faults(
-    end_s: float, resimulate: Callable[..., _Resimulation], channels: list[str]
-) -> list[Explanation]:
-    """Return the faults of channels if the fit uses these only."""
+def _compare_rest(end_s: float, resimulate: Callable[..., _Resimulation], channels: list[str]) -> Rest:
+    """Return the comparison of a log with a fit of some channels only."""
     other = resimulate(channels=channels)
     assert other.tuned is not None
-    return sensor_faults(other.parts, other.nominal, min(end_s, other.tuned.end_s), other.others)
+    to_s = min(end_s, other.tuned.end_s)
+    trajectory, _ = other.judge_trajectory(to_s)
+    failed = [one.channel for one in trajectory if one.good is False]
+    return Rest(sensor_faults(other.parts, other.nominal, to_s, other.others), failed, is_evidence=to_s >= end_s)
 
 
 def find_assumed_corners(recording: Recording) -> dict[str, float]:
@@ -523,14 +526,14 @@ def explain_assumed(explained: Explained, recording: Recording, passed: Mapping[
     best = [one for one in explained.ranked if one.name in explained.best]
     if best and all(one.kind == "sensor" for one in best):
         known = select_channels(best, failed)
-        rest = [name for name in failed if name not in known]
+        rest = [name for name in failed if name not in known and explained.settled.get(name) != "effect"]
         if len(rest) > len(known) and len(failed) > FEW_CHANNELS * len(passed):
             # What many others contradict is not the cause, however large its part of the squares is; few others may
             # fail as it moved the fit.
             text = f"{len(rest)} of {len(failed)} channels that fail have no known cause: the model differs, or "
             conclusion = f"{text}several faults; closest is {conclusion.removeprefix('sensor: ')}"
             return replace(explained, conclusion=conclusion, ranked=tuple(ranked), best=())
-        for name in rest:
+        for name in (name for name in rest if name not in explained.settled):
             assumed = f" (assumed: low-pass of {corners[name]:g} Hz)" if name in corners else ""
             conclusion += f"; {name} fails without a known cause{assumed}"
     return replace(explained, conclusion=conclusion, ranked=tuple(ranked))

@@ -142,6 +142,10 @@ class Validation:
         unknown = [one.key for one in self.fitted if one.key in self.floating and not one.is_determined]
         if unknown:
             return f"the recording does not determine {', '.join(unknown)}; the rest passes"
+        if unsure := [one.line for one in self.fitted if one.beyond and not one.contradicts_prior]:
+            return (
+                f"at the limit of what is known, but not determined by this log: {'; '.join(unsure)}; the rest passes"
+            )
         if self.bit_exact and not self.declared:
             rows = sum(one.rows for one in self.bits.values())
             if rows < _MIN_JUDGED * (rows + self.skipped):
@@ -162,7 +166,7 @@ class Validation:
     @property
     def beyond(self) -> list[str]:
         """Fitted numbers outside their known uncertainty, as text; each is a failure even if the model fits."""
-        return [one.line for one in self.fitted if one.beyond]
+        return [one.line for one in self.fitted if one.contradicts_prior]
 
     @property
     def failures(self) -> list[Failure]:

@@ -7,8 +7,8 @@ part of the residual that each candidate explains, so that equally good candidat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -79,6 +79,7 @@ class Explained:
         conclusion: Conclusion in a sentence.
         best: Names of the explanations in the conclusion.
         unsettled: Channels whose small differences are an effect of the faults in the conclusion, or other faults.
+        settled: Further channels that differ, by name: an "effect" of these faults on the fit, or another "fault".
     """
 
     from_s: float
@@ -87,6 +88,21 @@ class Explained:
     conclusion: str
     best: tuple[str, ...]
     unsettled: tuple[str, ...] = ()
+    settled: dict[str, str] = field(default_factory=dict)
+
+
+class Rest(NamedTuple):
+    """Comparison of a log with a fit that does not use its faulty channels.
+
+    Attributes:
+        faults: Faults of the channels that are left.
+        failed: Names of the channels that fail.
+        is_evidence: Whether as much is compared as with the faulty channels.
+    """
+
+    faults: list[Explanation]
+    failed: list[str]
+    is_evidence: bool
 
 
 def attribute(
@@ -251,7 +267,10 @@ def explain_log(
         conclusion = f"a change of {_list(small[:_MAX_NAMED])} would explain it, which no calibration knows: "
         conclusion += "another cause, or the model's equations"
     elif not best:
-        conclusion = "neither a sensor nor the clock explains it: the model differs"
+        unsure = "; ".join(one.line for one in tuned.fitted if one.beyond and not one.contradicts_prior)
+        conclusion = "neither a sensor nor the clock explains it" * (not unsure)
+        conclusion += f"no sensor explains it, and this log does not determine {unsure}" * bool(unsure)
+        conclusion += ": the model differs"
         if any(one.name.startswith("contact.") for one in rules.candidates):
             conclusion += " from the first contact on (`rig identify --fit contact.friction,contact.restitution`)"
         else:
@@ -262,27 +281,46 @@ def explain_log(
 
 
 def settle_channels(
-    explained: Explained, channels: list[str], find_faults: Callable[[list[str]], list[Explanation]]
+    explained: Explained, passed: Mapping[str, bool], channels: list[str], compare: Callable[[list[str]], Rest]
 ) -> Explained:
-    """Return the explanation of a log with a word on its unsettled channels: another fault, or an effect of the first.
+    """Return the explanation of a log by sensors with further channels that differ: by other faults, or as an effect.
 
     Args:
         explained: The explanation.
+        passed: Whether each judged channel passes.
         channels: Channels of the fit.
-        find_faults: Function that returns the faults of some channels if the fit uses these only.
+        compare: Function that compares the log with a fit of some channels only.
     """
-    known = select_channels([one for one in explained.ranked if one.name in explained.best], channels)
-    if not (explained.unsettled and known):
+    causes = [one for one in explained.ranked if one.name in explained.best]
+    known = select_channels(causes, channels)
+    off = [
+        name for name in channels
+        if name not in known and (name in explained.unsettled or not passed.get(name, True))
+    ]  # fmt: skip
+    used = [name for name in channels if name not in known]
+    if not off or any(one.kind != "sensor" for one in causes) or len(causes) < len(explained.best):
         return explained
-    left = find_faults([name for name in channels if name not in known])
-    conclusion, without = explained.conclusion, f"without {_join(known)}"
-    for name in explained.unsettled:
-        found = next((one for one in left if select_channels([one], [name])), None)
-        if found is None:
-            conclusion += f"; {name} is as predicted {without}: its small difference is an effect of the fault"
-        else:
-            conclusion += f"; {name} differs also {without}: another fault, closest is {found.name} {found.change}"
-    return replace(explained, conclusion=conclusion, unsettled=())
+    rest = compare(used) if causes and len(used) > len(known) else Rest([], [], is_evidence=False)
+    if not rest.is_evidence:
+        text = f"; {_join(off)} in addition: an effect, or another fault" if explained.unsettled else ""
+        return replace(explained, conclusion=explained.conclusion + text)
+    conclusion, without = explained.conclusion, f"a fit without {_join(known)}"
+    found = {name: [one for one in rest.faults if select_channels([one], [name])][:1] for name in off}
+    effects = [name for name in off if not found[name] and name not in rest.failed]
+    if effects:
+        verb = "differ" if effects[1:] else "differs"
+        conclusion += f"; {_join(effects)} {verb} only through the fit: {without} shows no difference"
+    others = list(dict.fromkeys(one for name in off for one in found[name]))
+    for one in others:
+        conclusion += f"; another fault, also in {without}, closest is {one.name} {one.change}"
+    for name in (name for name in off if name not in effects and not found[name]):
+        conclusion += f"; {name} fails, also in {without}, without a known cause"
+    named = [one for one in others if one.at_floor and select_channels([one], rest.failed)]
+    return replace(
+        explained, conclusion=conclusion, ranked=(*explained.ranked, *named),
+        best=(*explained.best, *(one.name for one in named)),
+        settled={name: "effect" if name in effects else "fault" for name in off},
+    )  # fmt: skip
 
 
 def _find_size(experiment: Experiment, one: Explanation, rules: Attribution) -> float:
