@@ -531,6 +531,14 @@ def test_a_log_has_to_begin_before_the_pulse(motion: second_rig.Motion, tmp_path
         validate(recording)
 
 
+def test_a_log_has_to_show_where_the_shaft_is(motion: second_rig.Motion, tmp_path: Path) -> None:
+    own_s, values = second_rig.record_log(motion, seed=5, ppm=PPM)
+    few, parts = ("P_E", "P_W", "inner_x", "hammer", "speed"), WHOLE.split("[channels.")
+    mapping = "".join(f"[channels.{part}" for part in parts if part.partition("]")[0] in few)
+    with pytest.raises(InputError, match=r"shows the position of the shaft .* received .* with P_E, P_W, inner_x"):
+        validate(import_log(tmp_path, {"time": own_s, **{name: values[name] for name in few}}, mapping))
+
+
 TRUTH = {"contact.friction": 0.25, "contact.restitution": 0.9, "magnet.stiffness": 1.7}
 PULSE = ("hammer.1.force_n", "hammer.1.duration_ms")
 """Through impacts, force and duration differ by little more than their product."""

@@ -260,6 +260,9 @@ def fit_initial_state(recording: Recording, experiment: Experiment) -> Experimen
 
     Small motions are a superposition: free motion from the initial state, and the response to unbalance as a cosine and
     a sine. They are fitted by least squares over a few turns, with channels weighted by their residuals.
+
+    Raises:
+        InputError: The channels do not show the position of the shaft.
     """
     first_s = _pulse_time_s(experiment)
     experiment = _with_edge_speed(recording, experiment)
@@ -287,6 +290,11 @@ def fit_initial_state(recording: Recording, experiment: Experiment) -> Experimen
         columns.append(subtract_mean(np.column_stack(slopes)) / floor)
     solution = solve_weighted(target, columns, signal_sizes(parts))
     moves = np.array([*solution[2:], 0.0]) * predictor.scales
+    clearance_mm = get_value(experiment, "ring.clearance")
+    if experiment.begin is not None and math.hypot(*moves[:2]) > 2.0 * clearance_mm:
+        names = ", ".join(name for part in parts.values() for name in part.names)
+        must = "a log that shows the position of the shaft before the hammer pulse, as a pair of probes does"
+        raise InputError("file", must, Words(f"{recording.path} with {names}"))
     values = dict(zip(keys, (still + moves).tolist(), strict=True))
     return with_values(experiment, values | {ANGLE: math.atan2(solution[1], solution[0])})
 
