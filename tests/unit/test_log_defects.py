@@ -245,5 +245,5 @@ def test_differences_beside_a_fault_are_settled_by_a_fit_without_the_faulty_chan
     failed = settle(offset, failed="inner_x")
     assert (failed.settled["outer_y"], failed.best) == ("effect", ("P_S gain", "inner_x offset"))
     unknown = settle(is_evidence=False)
-    assert unknown.conclusion.endswith("; inner_x and outer_y in addition: an effect, or another fault")
+    assert unknown.conclusion.endswith("; inner_x in addition: an effect, or another fault")
     assert (unknown.settled, unknown.best) == ({}, ("P_S gain",))

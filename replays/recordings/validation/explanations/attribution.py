@@ -297,12 +297,14 @@ def settle_channels(
         name for name in channels
         if name not in known and (name in explained.unsettled or not passed.get(name, True))
     ]  # fmt: skip
-    used = [name for name in channels if name not in known]
-    if not off or any(one.kind != "sensor" for one in causes) or len(causes) < len(explained.best):
+    if not off:
         return explained
-    rest = compare(used) if causes and len(used) > len(known) else Rest([], [], is_evidence=False)
+    used = [name for name in channels if name not in known]
+    by_sensors = bool(causes) and {one.kind for one in causes} == {"sensor"} and len(causes) == len(explained.best)
+    rest = compare(used) if by_sensors and len(used) > len(known) else Rest([], [], is_evidence=False)
     if not rest.is_evidence:
-        text = f"; {_join(off)} in addition: an effect, or another fault" if explained.unsettled else ""
+        open_ones = [name for name in off if name in explained.unsettled]
+        text = f"; {_join(open_ones)} in addition: an effect, or another fault" if open_ones else ""
         return replace(explained, conclusion=explained.conclusion + text)
     conclusion, without = explained.conclusion, f"a fit without {_join(known)}"
     found = {name: [one for one in rest.faults if select_channels([one], [name])][:1] for name in off}
