@@ -247,3 +247,13 @@ def test_differences_beside_a_fault_are_settled_by_a_fit_without_the_faulty_chan
     unknown = settle(is_evidence=False)
     assert unknown.conclusion.endswith("; inner_x in addition: an effect, or another fault")
     assert (unknown.settled, unknown.best) == ({}, ("P_S gain",))
+
+
+@pytest.mark.parametrize(("gain", "names"), [(1.05, ["P_N, P_S gain"]), (-1.0, ["P_N polarity", "P_S polarity"])])
+def test_equal_gains_of_opposite_forces_are_no_swap(gain: float, names: list[str]) -> None:
+    opposite = 6000.0 - FORCE
+    pair = [show("P_N", FORCE, gain * FORCE, 1.0), show("P_S", opposite, gain * opposite, 1.0, seed=2)]
+    assert sorted(one.name for one in diagnose(pair, float(TIMES_S[-1]))) == names
+    swapped = [show("P_N", FORCE, opposite, 1.0), show("P_S", opposite, FORCE, 1.0, seed=2)]
+    (found,) = diagnose(swapped, float(TIMES_S[-1]))
+    assert found.name == "P_N and P_S"
