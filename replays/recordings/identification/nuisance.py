@@ -131,6 +131,11 @@ class Fitted:
         return self.beyond and (self.prior is None or abs(self.value - self.prior[0]) > self.half_width)
 
     @property
+    def is_at_limit(self) -> bool:
+        """True if the value is beyond its prior, but its interval contains the mean: the log does not determine it."""
+        return self.beyond and not self.contradicts_prior
+
+    @property
     def line(self) -> str:
         """The result in words."""
         if self.key == "clock.offset_s":

@@ -32,11 +32,7 @@ from replays.recordings.validation.explanations.attribution import (
 )
 from replays.recordings.validation.explanations.budget import Budget, make_fit_budgets, make_quantity_budgets
 from replays.recordings.validation.explanations.explanation import Explanation
-from replays.recordings.validation.explanations.faults import (
-    find_common_delay,
-    select_channels,
-    sensor_faults,
-)
+from replays.recordings.validation.explanations.faults import find_common_delay, select_channels, sensor_faults
 from replays.recordings.validation.explanations.model_parameters import find_changes
 from replays.recordings.validation.explanations.signals import (
     SignalFault,

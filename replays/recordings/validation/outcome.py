@@ -142,7 +142,7 @@ class Validation:
         unknown = [one.key for one in self.fitted if one.key in self.floating and not one.is_determined]
         if unknown:
             return f"the recording does not determine {', '.join(unknown)}; the rest passes"
-        if unsure := [one.line for one in self.fitted if one.beyond and not one.contradicts_prior]:
+        if unsure := [one.line for one in self.fitted if one.is_at_limit]:
             return (
                 f"at the limit of what is known, but not determined by this log: {'; '.join(unsure)}; the rest passes"
             )

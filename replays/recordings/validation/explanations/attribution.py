@@ -267,9 +267,9 @@ def explain_log(
         conclusion = f"a change of {_list(small[:_MAX_NAMED])} would explain it, which no calibration knows: "
         conclusion += "another cause, or the model's equations"
     elif not best:
-        unsure = "; ".join(one.line for one in tuned.fitted if one.beyond and not one.contradicts_prior)
-        conclusion = "neither a sensor nor the clock explains it" * (not unsure)
-        conclusion += f"no sensor explains it, and this log does not determine {unsure}" * bool(unsure)
+        conclusion = "neither a sensor nor the clock explains it"
+        if unsure := "; ".join(one.line for one in tuned.fitted if one.is_at_limit):
+            conclusion = f"no sensor explains it, and this log does not determine {unsure}"
         conclusion += ": the model differs"
         if any(one.name.startswith("contact.") for one in rules.candidates):
             conclusion += " from the first contact on (`rig identify --fit contact.friction,contact.restitution`)"
