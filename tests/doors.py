@@ -126,8 +126,12 @@ class RowsClient(Client):
         return row.bias_v + row.sensitivity_v * float(self.pieces[-1][name][-100:].mean())
 
     def loss(self) -> str:
-        rows = self.machine.daq.read(100, timeout_s=PATIENCE_S)
-        assert 0 < rows.gap <= self.machine.daq.dropped
+        """Find the gap before the next rows; a busy machine may also lose rows before they reach the buffer."""
+        daq = self.machine.daq
+        until(lambda: daq.dropped)
+        least = daq.dropped
+        rows = daq.read(100, timeout_s=PATIENCE_S)
+        assert least <= rows.gap <= daq.dropped + daq.unmatched + sum(daq.lost.values())
         return f"{rows.gap} rows"
 
     def end(self) -> str:
@@ -185,7 +189,7 @@ class DaqmxClient(Client):
 
     def loss(self) -> str:
         try:
-            self.receive()
+            until(self.task.is_task_done)
         except nidaqmx.DaqError as error:
             return f"{nidaqmx.error_codes.DAQmxErrors(error.error_code).name}"
         return ""

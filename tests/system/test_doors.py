@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import random
+import subprocess
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -52,6 +53,7 @@ class Bench:
 
     door: Door
     table: ChannelTable
+    process: subprocess.Popen[str]
     console: Console
     address: Any
     read_only: Any
@@ -68,6 +70,12 @@ class Bench:
         client = self.door.open(self.table, address or self.address)
         client.time_s = self.now_s
         return client
+
+    def stop(self) -> None:
+        """Stop the rig, which must end without an error."""
+        self.console.stop()
+        output = self.process.communicate(timeout=PATIENCE_S)
+        assert self.process.returncode == 0, output
 
 
 @contextmanager
@@ -90,52 +98,7 @@ def make_bench(name: str, folder: Path, *, several: bool = False) -> Iterator[Be
         door.serve(*door.access) as (_, address),
         door.serve() as (_, read_only),
     ):
-        yield Bench(door, table, console, address, read_only)
-        child.terminate()
-        assert child.wait(PATIENCE_S) == 0
-
-
-@pytest.fixture(scope="module")
-def bench(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with make_bench(request.param, tmp_path_factory.mktemp("bench")) as bench:
-        yield bench
-
-
-every_door = pytest.mark.parametrize("bench", list(DOORS), indirect=True)
-
-
-@every_door
-def test_a_fault_is_seen(bench: Bench) -> None:
-    with bench.open() as client:
-        fault = bench.console.fault("disk_x", "open", level_v=-3.0)
-        client.read(bench.step(0.5))
-        assert client.volts("disk_x") == pytest.approx(-3.0, abs=0.01)
-        assert client.volts("disk_y") != pytest.approx(-3.0, abs=0.5)
-        bench.console.clear(fault.fault)
-
-
-@every_door
-def test_malformed_messages_change_nothing(bench: Bench) -> None:
-    before = bench.console.status()
-    bench.door.attack(bench.address, random.Random(5), 300)
-    after = bench.console.status()
-    assert [after[key] for key in ("tick", "commands", "state", "warnings")] == [
-        before[key] for key in ("tick", "commands", "state", "warnings")
-    ]
-    with bench.open() as client:
-        client.read(bench.step(0.2))
-        client.act()
-
-
-@pytest.mark.parametrize("bench", ALLOWED, indirect=True)
-def test_commands_are_refused_unless_allowed(bench: Bench) -> None:
-    before = bench.console.status()["commands"]
-    error, words = bench.door.refusal
-    with bench.open(bench.read_only) as client:
-        with pytest.raises(error, match=words):
-            client.act()
-        assert bench.console.status()["commands"] == before
-        client.read(bench.step(0.2))
+        yield Bench(door, table, child, console, address, read_only)
 
 
 @pytest.mark.parametrize(("name", "several"), RATES)
@@ -154,7 +117,7 @@ def test_rows_are_those_of_the_recording(name: str, several: bool, tmp_path: Pat
         client.act()
         client.read(bench.step(0.3))
         client.read(bench.step(0.2))
-        bench.console.stop()
+        bench.stop()
         recorder.join(PATIENCE_S)
         client.compare(recorded := Recorded.read(path))
     assert len(recorded.counts) == 14 if several else 15
@@ -199,3 +162,48 @@ def test_a_client_before_the_rig_is_served_and_learns_of_its_end(name: str) -> N
                     if door.continues:
                         client.resume()
                     assert second.poll() is None
+
+
+# A rig in lockstep ends if it is not stepped for five minutes, so its tests come last, one after another.
+@pytest.fixture(scope="module")
+def bench(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    with make_bench(request.param, tmp_path_factory.mktemp("bench")) as bench:
+        yield bench
+        bench.stop()
+
+
+every_door = pytest.mark.parametrize("bench", list(DOORS), indirect=True)
+
+
+@every_door
+def test_a_fault_is_seen(bench: Bench) -> None:
+    with bench.open() as client:
+        fault = bench.console.fault("disk_x", "open", level_v=-3.0)
+        client.read(bench.step(0.5))
+        assert client.volts("disk_x") == pytest.approx(-3.0, abs=0.01)
+        assert client.volts("disk_y") != pytest.approx(-3.0, abs=0.5)
+        bench.console.clear(fault.fault)
+
+
+@every_door
+def test_malformed_messages_change_nothing(bench: Bench) -> None:
+    before = bench.console.status()
+    bench.door.attack(bench.address, random.Random(5), 300)
+    after = bench.console.status()
+    assert [after[key] for key in ("tick", "commands", "state", "warnings")] == [
+        before[key] for key in ("tick", "commands", "state", "warnings")
+    ]
+    with bench.open() as client:
+        client.read(bench.step(0.5))
+        client.act()
+
+
+@pytest.mark.parametrize("bench", ALLOWED, indirect=True)
+def test_commands_are_refused_unless_allowed(bench: Bench) -> None:
+    before = bench.console.status()["commands"]
+    error, words = bench.door.refusal
+    with bench.open(bench.read_only) as client:
+        with pytest.raises(error, match=words):
+            client.act()
+        assert bench.console.status()["commands"] == before
+        client.read(bench.step(0.5))
