@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from threading import Event
+from queue import SimpleQueue
+from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -284,17 +285,36 @@ def local_workers(count: int | None = None) -> Iterator[Workers]:
 def iterate_results(
     workers: Workers, numbers: Iterable[int], function: Callable[..., Any], *arguments: Any
 ) -> Iterator[tuple[int, Any]]:
-    """Yield each number and `function(*arguments, number)` as they finish; only a few calls wait at a time."""
+    """Yield each number and `function(*arguments, number)` as they finish; only a few calls wait at a time.
+
+    An interrupt may stop this generator anywhere. So it touches only queues without a lock in Python; a thread submits.
+    """
     submit, find_limit = workers
-    waiting: dict[Future[Any], int] = {}
-    rest = iter(numbers)
-    while True:
-        while len(waiting) < max(find_limit(), 1) and (number := next(rest, None)) is not None:
-            waiting[submit(function, *arguments, number)] = number
-        if not waiting:
-            return
-        for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-            yield waiting.pop(future), future.result()
+    wanted, finished = SimpleQueue[int | None](), SimpleQueue[tuple[int, Future[Any]]]()
+
+    def submit_each() -> None:
+        while (number := wanted.get()) is not None:
+            try:
+                future = submit(function, *arguments, number)
+            except Exception as error:
+                future = Future[Any]()
+                future.set_exception(error)
+            future.add_done_callback(lambda future, number=number: finished.put((number, future)))
+
+    Thread(target=submit_each, name="submit", daemon=True).start()
+    rest, waiting = iter(numbers), 0
+    try:
+        while True:
+            while waiting < max(find_limit(), 1) and (number := next(rest, None)) is not None:
+                wanted.put(number)
+                waiting += 1
+            if not waiting:
+                return
+            number, future = finished.get()
+            waiting -= 1
+            yield number, future.result()
+    finally:
+        wanted.put(None)
 
 
 def ensemble(

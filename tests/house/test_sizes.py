@@ -49,7 +49,7 @@ BUDGETS = {
     "rig/base": 1079,
     "rig/channels": 2600,
     "rig/cli": 6292,
-    "rig/ensemble": 2019,
+    "rig/ensemble": 2039,
     "rig/physics": 5488,
     "rig/run": 1900,
     "rig/serve": 3072,

@@ -22,6 +22,7 @@ from rig.ensemble import plan as plans
 from rig.ensemble.ensemble import local_workers
 from rig.ensemble.sweep import Sweep
 from tests.processes import free_port, read_line, start_python, start_rig
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.wallclock
 
@@ -137,11 +138,37 @@ def test_ctrl_c_ends_a_sweep_and_keeps_its_parts(plan: Path, parts: dict[str, by
         assert child.stdout is not None
         child.stdout.readline()
         child.send_signal(signal.SIGINT)
-        _, err = child.communicate(timeout=60.0)
+        _, err = child.communicate(timeout=PATIENCE_S)
     assert (child.returncode, err.splitlines()[-1]) == (130, "rig: interrupted")
     left = read_parts(tmp_path / "out")
     assert left.items() <= parts.items()
     assert 1 <= len(left) < 30
+
+
+INTERRUPTED = """
+import itertools, random, signal
+from rig.cli import signals
+from rig.ensemble.ensemble import iterate_results, local_workers
+
+signals.listen()  # an interrupt that a callback swallows comes again
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+draw, ended = random.Random(1), 0
+for _ in range(1000):
+    try:
+        with local_workers(2) as workers:
+            signal.setitimer(signal.ITIMER_REAL, draw.uniform(1e-3, 4e-3))
+            for _ in iterate_results(workers, itertools.count(), lambda number, stop: number):
+                pass
+    except KeyboardInterrupt:
+        ended += 1
+print(ended)
+"""
+
+
+def test_an_interrupt_at_any_moment_ends_all_workers() -> None:
+    with start_python("-c", INTERRUPTED) as child:
+        assert child.communicate(timeout=PATIENCE_S) == ("1000\n", "")
+    assert child.returncode == 0
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ from tests.unit.viewer_recording import (
 
 
 def save(recording: Any, path: Path) -> file.Painted:
-    stream = new_stream("test")
+    stream = new_stream("test", batch_s=60.0)  # the size must not depend on the load of the machine
     plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
     stream.save(path, default_blueprint=plan)
     painted = file.paint(recording, Canvas(stream))
