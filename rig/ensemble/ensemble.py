@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from _thread import start_new_thread  # noqa: PLC2701 public, and named so
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Event, Thread
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -296,14 +297,14 @@ def iterate_results(
         while (number := wanted.get()) is not None:
             try:
                 future = submit(function, *arguments, number)
-            except Exception as error:
+            except BaseException as error:
                 future = Future[Any]()
                 future.set_exception(error)
             future.add_done_callback(lambda future, number=number: finished.put((number, future)))
 
-    Thread(target=submit_each, name="submit", daemon=True).start()
     rest, waiting = iter(numbers), 0
     try:
+        start_new_thread(submit_each, ())  # `Thread.start` waits for a lock in Python
         while True:
             while waiting < max(find_limit(), 1) and (number := next(rest, None)) is not None:
                 wanted.put(number)

@@ -40,7 +40,7 @@ BUDGETS = {
     "replays/estimate": 590,
     "replays/player": 822,
     "replays/plots": 1754,
-    "replays/recordings": 12740,
+    "replays/recordings": 12775,
     "replays/report": 531,
     "replays/score": 4253,
     "replays/sessions": 77,

@@ -32,7 +32,7 @@ from replays.recordings.validation.explanations.attribution import Explained
 from replays.recordings.validation.explanations.budget import make_fit_budgets
 from replays.recordings.validation.explanations.channel_fit import Shown
 from replays.recordings.validation.explanations.explanation import Explanation
-from replays.recordings.validation.explanations.faults import sensor_faults
+from replays.recordings.validation.explanations.faults import select_channels, sensor_faults
 from replays.recordings.validation.explanations.signals import edge_faults
 from replays.recordings.validation.explanations.timing import filtered
 from replays.recordings.validation.trajectory import residuals
@@ -211,18 +211,28 @@ def test_an_offset_below_the_noise_is_found_by_its_mean(offset: float) -> None:
     assert (fault and fault.name) == ("P_W offset" if offset else None)
 
 
-@pytest.mark.parametrize(("others", "named"), [("inner_x inner_y", True), ("inner_x P_S P_E P_W", False)])
-def test_a_fault_that_moves_few_other_channels_is_named(others: str, named: bool) -> None:
-    """It moves others through the fit; but many channels that fail without a cause contradict it."""
-    fault = Explanation("sensor", "P_N AC coupling", "corner at 4 Hz", 4.0, "Hz", 1.0, 1.0, 9.0, 9, 1.0)
+@pytest.mark.parametrize(("defects", "others", "named"), [
+    ("P_N AC coupling", "inner_x inner_y", True), ("P_N AC coupling", "inner_x P_S P_E P_W", False),
+    ("ring_x offset and run-out", "inner_x", True), ("ring_x offset and run-out", "disk_x", False),
+    ("ring_x delay", "disk_x", True),
+    ("ring_x hum 50 Hz, 1 mm", "disk_x", True), ("ring_x hum 6 Hz, 1 mm", "disk_x", False),
+    ("ring_x gain; disk_y offset", "", True), ("speed gain; ring_x gain; disk_x offset", "", False),
+    ("ring_x and ring_y gain", "", True), ("ring_x, ring_y gain", "disk_x", False),
+])  # fmt: skip
+def test_a_fault_that_moves_few_other_channels_is_named(defects: str, others: str, named: bool) -> None:
+    """It moves others through the fit; many channels that fail without a cause, or motion that differs, contradict."""
+    parts = (re.fullmatch(r"(.*?)(?: (\d.*))?", one).groups(default="") for one in defects.split("; "))
+    faults = tuple(Explanation("sensor", name, change, 4.0, "", 1.0, 1.0, 9.0, 9, 1.0) for name, change in parts)
     names = [one for one in default_table().channels if one != "hammer"]
     log: Any = SimpleNamespace(scene={"import": {"mapping": {"channels": {}}}}, table=default_table())
-    explained = Explained(0.0, 1.0, (fault,), "sensor: P_N AC coupling", (fault.name,))
-    found = explain_assumed(explained, log, {one: one not in ("P_N", *others.split()) for one in names})
-    assert found.best == ((fault.name,) if named else ())
-    assert named == found.conclusion.endswith(
-        "; inner_x fails without a known cause; inner_y fails without a known cause"
+    best = tuple(one.name for one in faults)
+    failed = [*select_channels([*faults], names), *others.split()]
+    found = explain_assumed(
+        Explained(0.0, 1.0, faults, f"sensor: {defects}", best), log, {one: one not in failed for one in names}
     )
+    assert found.best == (best if named else ())
+    assert found.conclusion.startswith("sensor: ") == named
+    assert found.conclusion.count("fails without a known cause") == (len(others.split()) if named else 0)
 
 
 def test_floated_friction_of_a_log_is_fitted_and_the_rest_is_judged_with_it(mils: Recording) -> None:

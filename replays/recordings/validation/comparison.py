@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -56,6 +58,7 @@ from replays.recordings.validation.trajectory import (
 from replays.recordings.validation.truth import TruthTables, find_contradictions, judge_truth, recorded_truth
 from rig.base.errors import InputError, Words
 from rig.base.wire import TRUTH
+from rig.channels.table import default_table
 
 _CONTACT_MARGIN_S = 1e-3
 """Time before the first contact in the signals by which a difference is earlier [s]: that of filters."""
@@ -63,6 +66,10 @@ _MIN_SCAN_RATIO = 3.0
 """Smallest time between a scanner's channels over its half width."""
 _MAX_CHECKED = 3
 """Largest number of named numbers of the model that are checked by the phases."""
+_MOTION = {"offset", "gain", "drift", "run-out"}
+"""Defects of a probe that slow motion resembles."""
+_LEAST_MAINS_HZ = 16.0
+"""Lowest frequency of any mains [Hz]; slower hum resembles motion."""
 
 
 def validate(
@@ -519,20 +526,47 @@ def explain_assumed(explained: Explained, recording: Recording, passed: Mapping[
             conclusion = conclusion.replace(f"{one.name} {one.change}", advice)
             one = replace(one, change=change)
         ranked.append(one)
-    best = [one for one in explained.ranked if one.name in explained.best]
+    best = [one for one in ranked if one.name in explained.best]
     if best and all(one.kind == "sensor" for one in best):
         known = select_channels(best, failed)
         rest = [name for name in failed if name not in known and explained.settled.get(name) != "effect"]
+        closest = (
+            f"the model differs, or several faults; closest is {'; '.join(f'{one.name} {one.change}' for one in best)}"
+        )
         if len(rest) > len(known) and len(failed) > FEW_CHANNELS * len(passed):
             # What many others contradict is not the cause, however large its part of the squares is; few others may
             # fail as it moved the fit.
-            text = f"{len(rest)} of {len(failed)} channels that fail have no known cause: the model differs, or "
-            conclusion = f"{text}several faults; closest is {conclusion.removeprefix('sensor: ')}"
+            conclusion = f"{len(rest)} of {len(failed)} channels that fail have no known cause: {closest}"
+            return replace(explained, conclusion=conclusion, ranked=tuple(ranked), best=())
+        if moving := _find_motion(best, rest):
+            conclusion = f"{', '.join(moving)} may show another motion: {closest}"
             return replace(explained, conclusion=conclusion, ranked=tuple(ranked), best=())
         for name in (name for name in rest if name not in explained.settled):
             assumed = f" (assumed: low-pass of {corners[name]:g} Hz)" if name in corners else ""
             conclusion += f"; {name} fails without a known cause{assumed}"
     return replace(explained, conclusion=conclusion, ranked=tuple(ranked))
+
+
+def _is_slow(defect: Explanation) -> bool:
+    """Return whether slow motion resembles a defect."""
+    defects = defect.channels_and_defect[1].split(" and ")
+    line = re.search(r"([\d.]+) Hz", defect.change) if "hum" in defects else None
+    return not _MOTION.isdisjoint(defects) or (line is not None and float(line[1]) < _LEAST_MAINS_HZ)
+
+
+def _find_motion(causes: Iterable[Explanation], rest: Sequence[str]) -> list[str]:
+    """Return the probes whose differences may be motion, which both planes show, instead of defects.
+
+    Args:
+        causes: The defects found.
+        rest: Channels that fail for no known cause.
+    """
+    probes = default_table().groups["probes"].names
+    slow = [names for one in causes if _is_slow(one) and (names := select_channels([one], probes))]
+    others = [name for name in rest if name in probes]
+    directions = [direction for names in slow for direction in {name.rpartition("_")[2] for name in names}]
+    in_both_planes = len(set(directions)) < len(directions)
+    return [*chain(*slow), *others] if slow and (others or in_both_planes) else []
 
 
 def calibration(recording: Recording, experiment: Experiment) -> list[str]:

@@ -35,6 +35,8 @@ MIN_PART = 0.9
 """Part of the difference that sensors must explain together, if the model is not exact."""
 _EQUAL_PART = 0.2
 """Relative difference of changes that may be one common change."""
+_MIN_NOISE_RATIO = 1.1
+"""Smallest ratio of noise in a log to that of its quiet part that is a fault."""
 _SEARCH_ROWS = 400
 """Range of the first search for a time offset [samples], in either direction."""
 
@@ -95,7 +97,10 @@ def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lam
     alone, singles = [], [one for name, one in off.items() if name not in names]
     for n, one in enumerate(singles, 1):
         step(f"faults of {one.name}, {n} of {len(singles)}")
-        alone.append(_explain_channel(one, explain))
+        fault = _explain_channel(one, explain)
+        named = fault.explanation
+        if one.counts is not None or named.name != f"{one.name} noise" or named.value > _MIN_NOISE_RATIO:
+            alone.append(fault)
     return faults + _merge_equal(alone, explain, [one.name for one in shown if one.moves])
 
 
@@ -237,7 +242,11 @@ def _explain_swap(a: Shown, b: Shown, explain: _ExplanationMaker) -> Explanation
 
 
 def _explain_turn(a: Shown, b: Shown, explain: _ExplanationMaker) -> Explanation | None:
-    """Return the explanation by two probes at another angle, whose signals are rotated by it, or None."""
+    """Return the explanation by two probes of a plane at another angle, whose signals are rotated by it, or None."""
+    if a.name.rpartition("_")[0] != b.name.rpartition("_")[0]:
+        return None
+    if all(is_noise(one.solve([one.level], one.values - one.expected)[1]) for one in (a, b)):
+        return None  # offsets
     ones = np.ones(len(a.expected))
     (aa, ab, _), residual_a = a.solve([a.expected, b.expected, ones])
     (ba, bb, _), residual_b = b.solve([a.expected, b.expected, ones])
