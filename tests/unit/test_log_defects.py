@@ -257,3 +257,11 @@ def test_equal_gains_of_opposite_forces_are_no_swap(gain: float, names: list[str
     swapped = [show("P_N", FORCE, opposite, 1.0), show("P_S", opposite, FORCE, 1.0, seed=2)]
     (found,) = diagnose(swapped, float(TIMES_S[-1]))
     assert found.name == "P_N and P_S"
+
+
+@pytest.mark.parametrize(("times", "named"), [(1.08, False), (1.15, True)])
+def test_a_tenth_more_noise_in_a_log_is_no_fault(times: float, named: bool) -> None:
+    loud = show("outer_x", FORCE, FORCE, times)
+    shown = replace(loud, floor=np.ones(len(TIMES_S)), noise=1.0)
+    found = [one.name for one in diagnose([shown], float(TIMES_S[-1]))]
+    assert found == (["outer_x noise"] if named else [])
