@@ -530,16 +530,16 @@ def explain_assumed(explained: Explained, recording: Recording, passed: Mapping[
     if best and all(one.kind == "sensor" for one in best):
         known = select_channels(best, failed)
         rest = [name for name in failed if name not in known and explained.settled.get(name) != "effect"]
-        closest = (
-            f"the model differs, or several faults; closest is {'; '.join(f'{one.name} {one.change}' for one in best)}"
-        )
+        doubt = ""
         if len(rest) > len(known) and len(failed) > FEW_CHANNELS * len(passed):
             # What many others contradict is not the cause, however large its part of the squares is; few others may
             # fail as it moved the fit.
-            conclusion = f"{len(rest)} of {len(failed)} channels that fail have no known cause: {closest}"
-            return replace(explained, conclusion=conclusion, ranked=tuple(ranked), best=())
-        if moving := _find_motion(best, rest):
-            conclusion = f"{', '.join(moving)} may show another motion: {closest}"
+            doubt = f"{len(rest)} of {len(failed)} channels that fail have no known cause"
+        elif moving := _find_motion(best, rest):
+            doubt = f"{', '.join(moving)} may show another motion"
+        if doubt:
+            closest = "; ".join(f"{one.name} {one.change}" for one in best)
+            conclusion = f"{doubt}: the model differs, or several faults; closest is {closest}"
             return replace(explained, conclusion=conclusion, ranked=tuple(ranked), best=())
         for name in (name for name in rest if name not in explained.settled):
             assumed = f" (assumed: low-pass of {corners[name]:g} Hz)" if name in corners else ""
