@@ -424,7 +424,7 @@ class CanDoor(Door):
 
     @contextmanager
     def serve(self, *options: str) -> Iterator[tuple[None, Any]]:
-        yield None, f"can:zenoh:can0?endpoint={self._medium}&connect_s={PATIENCE_S:g}{self._channels}"
+        yield None, f"can:zenoh:can0?endpoint={self._medium}{self._channels}"
 
     def attack(self, address: Any, draw: random.Random, count: int) -> None:
         """Send frames of commands with a flipped bit, or of another length."""

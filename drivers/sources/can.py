@@ -149,6 +149,8 @@ class CanSource:
         from drivers.link.can import open_bus, parse_spec
 
         interface, channel, settings = parse_spec(spec)
+        if interface == "zenoh":
+            settings.setdefault("connect_s", wait_s)
         self._layout_name = settings.pop("layout", None)
         if self._layout_name not in (None, "fd", "classic"):
             raise InputError("layout", "fd or classic", self._layout_name)

@@ -23,7 +23,7 @@ from rig.serve.transport.endpoint import parse_endpoint, read_backlogs
 from rig.serve.transport.recovery import Recovery
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint
-from tests.waiting import until
+from tests.waiting import time_limit, until
 
 pytestmark = pytest.mark.wallclock
 
@@ -185,6 +185,15 @@ def test_every_first_request_is_answered(server: ZenohServer) -> None:
     for _ in range(20):
         with ZenohClient(server.endpoint) as client:
             assert client.request("rig/status", timeout_s=10.0) == b"yes"
+
+
+def test_the_first_request_waits_as_long_as_the_client_and_later_ones_do_not(server: ZenohServer) -> None:
+    with ZenohClient(server.endpoint, wait_s=60.0) as client:
+        starts = threading.Timer(0.5, lambda: server.answer("rig/status", lambda _: b"yes"))
+        starts.start()
+        assert client.request("rig/status", timeout_s=0.1) == b"yes"
+        with time_limit(30.0), pytest.raises(NoReplyError):
+            client.request("rig/nothing", timeout_s=0.1)
 
 
 def test_reports_reach_the_rig_and_not_the_own_subscriptions(server: ZenohServer) -> None:

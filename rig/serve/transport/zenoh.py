@@ -62,6 +62,8 @@ _REMOTE_LIMITS = {"transport/unicast/max_sessions": 32, "transport/unicast/accep
 _OPENING_S, _OPENING_TLS_S, _RESTART_S = 0.5, 2.0, 5.0
 """Time limits: one attempt to connect, on the loopback and beyond it (several round trips), and the wait of a request
 without a link for a restarted rig [s]."""
+_LONGEST_REQUEST_S = 86_400.0
+"""Longest wait for the first reply, if the client waits for a rig without end [s]."""
 _RETRY_S = 0.05
 """Pause before an unanswered request is repeated [s]."""
 
@@ -276,7 +278,7 @@ class ZenohClient(Closing):
 
     Args:
         endpoint: HOST:PORT of the rig, or its name.
-        wait_s: Longest wait for a rig [s]; may be infinite.
+        wait_s: Longest wait for a rig and its first reply [s]; may be infinite. A rig listens before it can reply.
         tls: Folder with the keys of a role (`rig keys init`), for an exposed rig; None connects without TLS.
 
     Raises:
@@ -285,6 +287,7 @@ class ZenohClient(Closing):
     """
 
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0, tls: Path | str | None = None) -> None:
+        self._opening, self._is_answered = Deadline(wait_s), False
         self._host, self._port = resolve_endpoint(endpoint, field="connect", wait_s=wait_s)
         self._holder: Holder | None = None
         if tls is not None:
@@ -299,7 +302,7 @@ class ZenohClient(Closing):
         self.foreign = 0
         self._streams: Session | None = None
         self._lossless: list[tuple[str, Recovery]] = []
-        self._session = self._open(wait_s)
+        self._session = self._open(self._opening)
 
     @property
     def rig(self) -> str | None:
@@ -322,10 +325,9 @@ class ZenohClient(Closing):
     def _is_from_rig(self, sample: Any) -> bool:
         return self._is_linked_rig(None if (info := sample.source_info) is None else str(info.source_id.zid))
 
-    def _open(self, wait_s: float) -> Session:
+    def _open(self, deadline: Deadline) -> Session:
         import zenoh
 
-        deadline = Deadline(wait_s)
         longest_s, settings = _OPENING_S, {}
         if self._holder is not None:
             longest_s, settings = _OPENING_TLS_S, {"transport/link/tls": self._holder.settings(listens=False)}
@@ -398,7 +400,7 @@ class ZenohClient(Closing):
         import zenoh
 
         if self._streams is None:
-            self._streams = self._open(5.0)
+            self._streams = self._open(Deadline(5.0))
         streams, session = self._streams, self._streams.session
         self._linked_rigs()
         if not lossless:
@@ -464,12 +466,19 @@ class ZenohClient(Closing):
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Send a request to the rig and return its reply.
 
+        Args:
+            key: Key of the request.
+            payload: Content of the request.
+            timeout_s: Longest wait for the reply [s]; for the first, at least until the end of the client's `wait_s`.
+
         Raises:
             NoReplyError: There was no reply in time, or the rig failed or ended; it may have executed the request.
         """
         import zenoh
 
         role, key = self._role, bind_key(self._role, key)
+        if not self._is_answered:
+            timeout_s = max(timeout_s, min(self._opening.left_s, _LONGEST_REQUEST_S))
         deadline, restart_deadline, linked = (
             Deadline(timeout_s),
             Deadline(min(timeout_s, _RESTART_S)),
@@ -488,6 +497,7 @@ class ZenohClient(Closing):
             for reply in replies:
                 payload_back = reply.result.payload.to_bytes()
                 if reply.ok is not None:
+                    self._is_answered = True
                     return payload_back
                 if (text := payload_back.decode(errors="replace")) != "Timeout":
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
