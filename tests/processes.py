@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.waiting import PATIENCE_S
+
 ROOT = Path(__file__).parents[1]
 COMPILE_S = 600.0
 """Longest start with an empty cache: 35 s of processor time, thirty programs on two cores."""
@@ -64,7 +66,7 @@ def running_rig(scene: str, *arguments: str, says: str = "") -> Iterator[tuple[s
             read_line(child, words)
         yield child, endpoint
         child.terminate()
-        child.communicate(timeout=60.0)
+        child.communicate(timeout=PATIENCE_S)
 
 
 def read_line(child: subprocess.Popen[str], words: str) -> str:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 """Longer than any wait that succeeds; only a failing test waits this long."""
 
 

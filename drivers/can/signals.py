@@ -221,8 +221,13 @@ def _other_messages() -> list[CanMessage]:
             ),
         ),
         CanMessage(
-            "Clock", 0x6FF, 8, False, 1.0, True, RIG, "Whole seconds, to count wraps of time and index",
-            (CanSignal("seconds", 0, 32, unit="s", label="End of the last block, whole seconds of simulated time"),),
+            "Clock", 0x6FF, 8, False, 1.0, True, RIG,
+            "Whole seconds, to count wraps of time and index; and which samples to expect",
+            (
+                CanSignal("seconds", 0, 32, unit="s", label="End of the last block, whole seconds of simulated time"),
+                CanSignal("fd_messages", 32, 16, label="Number of sample messages of this run in FD frames"),
+                CanSignal("classic_messages", 48, 16, label="Number of sample messages of this run in classic frames"),
+            ),
         ),
         CanMessage(
             "Status", 0x700, 8, False, 0.5, True, RIG, "Status of the rig; rig/status has all of it",

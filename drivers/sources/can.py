@@ -33,7 +33,7 @@ _SILENCE_TIMEOUT_S = 3.0
 """A bus that is silent for longer has no rig any more: the rig sends a heartbeat every second."""
 _BATCH_S = 0.01
 _QUIET_S = 0.05
-"""Silence after which no further kind of sample message is expected."""
+"""Silence after which no further kind of sample message is expected, if the rig does not state their number."""
 _MAX_EARLY_FRAMES = 50_000
 """Buffered frames before Rates and Sync: about 5 s of all messages."""
 _TICK_RATE_HZ = 1e6
@@ -178,6 +178,8 @@ class CanSource:
         self._has_no_clock = False
         self._clock_s: int | None = None
         """Simulated time of the latest Clock [s]."""
+        self._numbers_of_messages = {"fd": 0, "classic": 0}
+        """Number of the run's sample messages by layout, from Clock; 0: not stated."""
         self._beat: dict[str, int] | None = None
         """Raw values of the latest Heartbeat."""
         self._is_restarted = False
@@ -212,12 +214,14 @@ class CanSource:
             raise InputError("layout", "one that the rig sends", layout)
         self._layout_name = layout
         rows = self._table.fd if layout == "fd" else self._table.classic
-        # A run may lack groups: list the messages that have been seen; in lockstep, all that may come.
-        count = -1
-        for _ in Deadline(_SILENCE_TIMEOUT_S).polls(_QUIET_S):
-            if self.lockstep or count >= max(1, len(self._seen_identifiers)):
+        # A run may lack groups: list the messages that have been seen; in lockstep, all that may come. Between the first
+        # and the last of a run's messages seconds pass on a busy machine.
+        count, stated = -1, self._numbers_of_messages[layout]
+        for _ in Deadline(max(_SILENCE_TIMEOUT_S, self._wait_s)).polls(_QUIET_S):
+            seen = sum(row.identifier in self._seen_identifiers for row in rows)
+            if self.lockstep or self._end_reason is not None or seen >= (stated or count) > 0:
                 break
-            count = len(self._seen_identifiers)
+            count = max(1, seen)
         return {
             row.name: tuple(channel.name for channel in row.samples.channels)
             for row in rows
@@ -326,6 +330,7 @@ class CanSource:
             self._new_sync = raw["index"]
         elif row.name == "Clock":
             self._clock_s = raw["seconds"]
+            self._numbers_of_messages = {layout: raw[f"{layout}_messages"] for layout in ("fd", "classic")}
             self._new_sync = self._new_sync if self._sync is None else self._sync % _WRAP
         elif row.name == "Rates":
             # Clock precedes it in each period; rigs of version 0.1 send none.

@@ -54,6 +54,7 @@ from tests.hostile.documents import generate_documents
 from tests.hostile.files import Layout, Rng, list_operations, spoil_bytes, spoil_json, write_file
 from tests.score_daqs import write_session
 from tests.score_files import _can_log, write_values
+from tests.waiting import PATIENCE_S
 
 BATCH = 100
 """Messages of a sequence."""
@@ -526,7 +527,7 @@ def serve_lockstep(server: Any = None) -> Iterator[tuple[Any, Any]]:
         yield server, service
     finally:
         service.stop()
-        thread.join(60.0)
+        thread.join(PATIENCE_S)
     assert summary.get("reason") == "stopped", summary or "the run does not end"
     assert summary["troubles"] == [], summary["troubles"]
 

@@ -46,7 +46,7 @@ from tests.hostile import input_count
 from tests.hostile.documents import generate_documents
 from tests.unit import link_memory as memory
 from tests.unit.instruments_fake import FakeRig
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 THREADS = {"can gateway sends", "can gateway receives", "can gateway asks"}
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(3600)]
@@ -300,7 +300,8 @@ def test_hostile_messages_to_the_hub_have_no_effect_on_others() -> None:
                 villain.receive(codec.decode(payload[16:]))
             if number % 20 == 0:
                 sender.send(
-                    can.Message(arbitration_id=1, data=sent.to_bytes(4, "big"), is_extended_id=False), timeout=5.0
+                    can.Message(arbitration_id=1, data=sent.to_bytes(4, "big"), is_extended_id=False),
+                    timeout=PATIENCE_S,
                 )
                 sent += 1
                 read()
@@ -405,7 +406,7 @@ class Flood:
 
     def write(self, data: bytes) -> None:
         rest = memoryview(data)
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + PATIENCE_S
         while rest:
             assert time.monotonic() < deadline, "hangs"
             readable, writable, _ = select.select([self._descriptor], [self._descriptor], [], 1.0)

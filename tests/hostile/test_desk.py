@@ -20,6 +20,7 @@ from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.hostile import input_count
 from tests.hostile.documents import generate_documents
 from tests.unit.service_fake import FakeSimulation
+from tests.waiting import PATIENCE_S
 
 EXAMPLES: dict[str, list[dict[str, Any]]] = {
     "hammer": [{"force_n": 100.0, "duration_ms": 5.0, "direction": "x", "from": "a"}, {"direction": 30.0}, {}],
@@ -61,7 +62,7 @@ def served() -> Any:
     thread.start()
     yield simulation, server, MemoryClient(server)
     service.stop()
-    thread.join(30.0)
+    thread.join(PATIENCE_S)
     assert summary["reason"] == "stopped", "the run went on to the end that was asked for"
     assert summary["troubles"] == [], "nothing fell through the checks"
 

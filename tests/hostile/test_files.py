@@ -168,7 +168,7 @@ def test_a_malformed_file_is_read_or_refused_without_a_traceback(layout: Layout,
 
 def test_a_block_in_a_far_future_costs_neither_time_nor_memory(layout: Layout, tmp_path: Path) -> None:
     tracemalloc.start()
-    begin = time.monotonic()
+    begin_s = time.process_time()
     for tick, index in ((2**52, 2**52), (1_003_000, 2**52), (2**52, 60), (2**53, 2**53 - 20), (3_000, 60)):
         changed = copy.copy(layout)
         changed.messages = [*layout.messages, ("rig/sensors/probes", make_far_block(tick, index), 2**62)]
@@ -179,7 +179,7 @@ def test_a_block_in_a_far_future_costs_neither_time_nor_memory(layout: Layout, t
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 300e6
-    assert time.monotonic() - begin < 60.0
+    assert time.process_time() - begin_s < 60.0
     assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 100e6
 
 
@@ -216,14 +216,14 @@ def test_a_packed_chunk_of_4_gb_is_refused_before_it_is_unpacked(
     chunk = _bomb(declared, packed, compression, zlib.crc32(bytes(1 << 20)))
     bomb.write_bytes(part.read_bytes() + chunk[: len(chunk) - cut])
     tracemalloc.start()
-    begin = time.monotonic()
+    begin_s = time.process_time()
     with contextlib.suppress(InputError) if cut else pytest.raises(InputError, match="intact"):
         Recording.open(bomb)
     recover(bomb, tmp_path / "new.mcap", force=True)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 200e6
-    assert time.monotonic() - begin < 10.0
+    assert time.process_time() - begin_s < 10.0
 
 
 def _of(layout: Layout, key: str = PROBES) -> list[int]:
@@ -379,10 +379,10 @@ def test_a_record_of_3_gb_is_not_read_into_memory(part: Path, tmp_path: Path, op
 def test_millions_of_tiny_records_are_refused_soon(record: bytes, tmp_path: Path) -> None:
     spoilt = tmp_path / "x.mcap"
     spoilt.write_bytes(MAGIC + record * 500_000)
-    begin = time.monotonic()
+    begin_s = time.process_time()
     with pytest.raises(InputError, match="file must be"):
         Recording.open(spoilt)
-    assert time.monotonic() - begin < 10.0
+    assert time.process_time() - begin_s < 10.0
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ from tests.hostile.test_can import make_request as make_instrument_request
 from tests.processes import free_endpoint
 from tests.unit.instruments_fake import FakeRig
 from tests.unit.test_daqmx import PlayedRig
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(3600)]
 WAITING = ("step", "note", "hammer")
@@ -77,14 +77,14 @@ def test_frames_in_lockstep_and_messages_to_a_hub_over_zenoh() -> None:
         Gateway(MemoryClient(server), own, Schedule(), paced=False) as gateway,
     ):
         ask(server, "step", b'{"blocks": 3}')
-        with CanClient(f"zenoh:can0?endpoint={endpoint}", wait_s=10.0) as client, ZenohClient(endpoint) as other:
+        with CanClient(f"zenoh:can0?endpoint={endpoint}", wait_s=PATIENCE_S) as client, ZenohClient(endpoint) as other:
             requests = generate_documents(rng, input_count(300), examples)
             for number, request in enumerate(requests):
                 identifier, _, data = make_frame_line(rng, messages).partition(" ")
                 if int(identifier, 16) == messages.by_name["Heartbeat"].identifier:
                     continue  # a second rig on the bus, which ends a client
                 frame = can.Message(arbitration_id=int(identifier, 16), data=bytes.fromhex(data), is_extended_id=False)
-                villain.send(frame, timeout=5.0)
+                villain.send(frame, timeout=PATIENCE_S)
                 offer, _ = make_offer(rng, bytes(16))
                 other.report(codec.offer_key("can0", f"ghost{number % 7}"), offer)
                 with contextlib.suppress(NoReplyError):
@@ -142,7 +142,7 @@ def test_requests_to_instruments_over_zenoh() -> None:
             for _ in range(input_count(300)):
                 codec_ = TWINS[rng.integers(len(TWINS))].CODEC
                 key = request_key(codec_.address.name)
-                reply = client.request(key, make_instrument_request(rng, codec_), timeout_s=5.0)
+                reply = client.request(key, make_instrument_request(rng, codec_), timeout_s=PATIENCE_S)
                 codec_.decode(reply)
                 replies += 1
     assert replies == input_count(300)

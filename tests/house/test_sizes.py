@@ -22,7 +22,7 @@ SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
     "drivers": 714,
-    "drivers/can": 4538,
+    "drivers/can": 4548,
     "drivers/daqmx": 1316,
     "drivers/examples": 86,
     "drivers/instruments": 845,
@@ -52,7 +52,7 @@ BUDGETS = {
     "rig/ensemble": 2039,
     "rig/physics": 5488,
     "rig/run": 1900,
-    "rig/serve": 3072,
+    "rig/serve": 3076,
 }
 _NO_CODE = (
     tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER,

@@ -17,6 +17,7 @@ from drivers.sources.can_client import CanClient
 from rig.base import wire
 from rig.serve.transport.zenoh import ZenohClient
 from tests.processes import COMPILE_S, free_endpoint, running_rig
+from tests.waiting import PATIENCE_S
 
 HEARTBEAT_S = 1.5
 """Longest wall time from one heartbeat to the next [s]."""
@@ -36,7 +37,7 @@ def main() -> int:
     with running_rig(options.scene, *settings) as (child, endpoint), ZenohClient(endpoint, wait_s=COMPILE_S) as client:
 
         def rig_s() -> float:
-            return wire.decode_document(client.request(wire.STATUS, timeout_s=60.0))["time_s"]
+            return wire.decode_document(client.request(wire.STATUS, timeout_s=PATIENCE_S))["time_s"]
 
         while (reached_s := rig_s()) < 60.0 * options.minutes:
             assert child.poll() is None, "the rig has ended"
@@ -44,12 +45,12 @@ def main() -> int:
         speed = reached_s / (time.monotonic() - began_s)
         print(f"{reached_s / 60:.1f} min simulated at {speed:.1f} times real time; a CAN client joins")
         right = 0
-        with CanClient(bus, wait_s=30.0) as late:
+        with CanClient(bus, wait_s=PATIENCE_S) as late:
             for channel in CHANNELS:
                 command = wire.encode_document({"channel": channel, "kind": "polarity"})  # valid in every scene
                 before_s = rig_s()
                 joined_s = wire.decode_document(late.request(wire.STATUS))["time_s"]
-                reply = wire.decode_document(late.request(wire.command_key("fault"), command, timeout_s=30.0))
+                reply = wire.decode_document(late.request(wire.command_key("fault"), command, timeout_s=PATIENCE_S))
                 after_s = rig_s()
                 reply_s = reply.get("time_s", math.nan)  # a refusal has none, and counts as wrong
                 right += before_s - HEARTBEAT_S * speed <= joined_s <= reply_s <= after_s and before_s <= reply_s

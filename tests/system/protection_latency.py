@@ -17,6 +17,7 @@ import numpy as np
 import rig
 from drivers.client import NotSeenError, Rig
 from tests import processes
+from tests.waiting import PATIENCE_S
 
 OPTIONS = (
     "--alert-um", "300", "--danger-um", "300", "--alert-delay-s", "0", "--danger-delay-s", "0", "--window-s", "0.05",
@@ -38,7 +39,7 @@ def measure_latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
         # Nothing reads its output: a pipe would fill up and block it.
         processes.start_python("-m", "drivers.protection", url, *OPTIONS, stdout=subprocess.DEVNULL, stderr=None),
     ):  # fmt: skip
-        machine.event(lambda event: "on" in event.get("tags", ()), timeout_s=60.0)
+        machine.event(lambda event: "on" in event.get("tags", ()), timeout_s=PATIENCE_S)
         time.sleep(0.5)
         while len(found) < trips:
             fault = machine.fault("disk_x", "offset", value=0.5, for_s=0.02)

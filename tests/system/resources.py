@@ -23,6 +23,7 @@ import numpy as np
 from rig.base import wire
 from rig.serve.transport.zenoh import ZenohClient
 from tests.processes import COMPILE_S, free_endpoint, start_python
+from tests.waiting import PATIENCE_S
 
 GOAL = 0.5
 """Largest growth [MB/min]."""
@@ -69,10 +70,10 @@ def main() -> int:
                 process = psutil.Process(child.pid)
                 samples[name].append((now_min, process.memory_info().rss / 1e6, process.num_fds()))
             time.sleep(1.0)
-        status = wire.decode_document(client.request(wire.STATUS, timeout_s=60.0))
+        status = wire.decode_document(client.request(wire.STATUS, timeout_s=PATIENCE_S))
         for child in reversed(children.values()):
             child.send_signal(signal.SIGINT)
-            child.wait(60.0)
+            child.wait(PATIENCE_S)
     good = True
     print(f"{'process':12}{'MB':>6}{'MB/min':>9}{'+-':>7}{'min needed':>12}  descriptors")
     for name, rows in samples.items():

@@ -22,7 +22,7 @@ from pathlib import Path
 import rig
 from recorder.reader import Recording
 from tests import processes
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 KILLS, STOPS_S = 20, (60.0, *[10.0] * 5)
 READS = """
@@ -103,7 +103,7 @@ def start_rig(stack: ExitStack, scene: str, *arguments: str) -> tuple[subprocess
 
 def describe_recording(recorder: subprocess.Popen[str], path: Path) -> str:
     """Return exit status of a recorder, the reason in its file, and whether rows were lost."""
-    output, _ = recorder.communicate(timeout=90.0)
+    output, _ = recorder.communicate(timeout=PATIENCE_S)
     lost = "no row lost" if "lost: nothing" in output else "rows lost, counted"
     return f"status {recorder.returncode}, {Recording.open(path).end_reason}, {lost}"
 
@@ -119,7 +119,7 @@ def signal_rig(trial: Trial) -> str:
     if trial.stop_s is not None:
         time.sleep(3.0)
         child.send_signal(signal.SIGTERM)
-    said = [line.strip() for line in client.communicate(timeout=90.0)[0].splitlines() if line != "reads"]
+    said = [line.strip() for line in client.communicate(timeout=PATIENCE_S)[0].splitlines() if line != "reads"]
     return f"{', '.join(sorted(said))}; recorder: {describe_recording(recorder, path)}"
 
 
@@ -145,7 +145,7 @@ def signal_device(trial: Trial) -> str:
     """Send the signal to a device in lockstep while the rig is stepped."""
     with rig.connect(trial.url, name="bench") as machine:
         device = trial.start("-c", DEVICE, trial.url)
-        machine.event(lambda event: event["event"] == "device" and event["state"] == "joined", timeout_s=60.0)
+        machine.event(lambda event: event["event"] == "device" and event["state"] == "joined", timeout_s=PATIENCE_S)
         machine.step(100_000)
         with ThreadPoolExecutor(1) as sender:
             sending = sender.submit(trial.signal, device)
@@ -155,7 +155,7 @@ def signal_device(trial: Trial) -> str:
                 time.sleep(0.01)
             machine.step(100_000)
             sending.result()
-        said = device.communicate(timeout=60.0)[0].split()[1:] if trial.stop_s else []
+        said = device.communicate(timeout=PATIENCE_S)[0].split()[1:] if trial.stop_s else []
         reason = lost["guard"].partition(" that ends")[0]
         return f"rig continues; lost: {reason}; device: {' '.join(said) or 'killed'}"
 
@@ -173,7 +173,7 @@ def signal_campaign(trial: Trial) -> str:
     campaign.wait(timeout=300.0)
     if trial.stop_s is not None:
         return f"status {campaign.returncode}"
-    until(lambda: not marked(mark), timeout_s=30.0)
+    until(lambda: not marked(mark), timeout_s=PATIENCE_S)
     return "no process left"
 
 

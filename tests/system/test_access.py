@@ -385,7 +385,7 @@ def serve_commands(endpoint: str, keys: Path) -> Iterator[RequestHandler]:
 
 
 def ask(session: zenoh.Session, command: str, **fields: Any) -> dict[str, Any] | None:
-    replies = session.get(f"rig/command/{command}", payload=json.dumps(fields), timeout=5.0)
+    replies = session.get(f"rig/command/{command}", payload=json.dumps(fields), timeout=PATIENCE_S)
     return next((json.loads(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None), None)
 
 

@@ -18,6 +18,7 @@ import pytest
 from recorder.reader import Recording
 from tests import processes, waiting
 from tests.unit.test_campaign_results import check_junit
+from tests.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.wallclock]
 
@@ -348,7 +349,7 @@ def test_ctrl_c_ends_all_processes_and_reports_finished_cases(tmp_path: Path) ->
         )  # each with its cleanup process
         remaining = descendants(child.pid)
         os.killpg(child.pid, signal.SIGINT)
-        out, err = child.communicate(timeout=60.0)
+        out, err = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 130, out + err
     waiting.until(lambda: not any(each.is_running() and each.status() != "zombie" for each in remaining), every_s=0.1)
     assert "1 passed, 3 not run" in out
@@ -455,7 +456,7 @@ def test_a_campaign_runs_on_a_recording_and_on_a_running_rig(folder: Path) -> No
                 raise
             _, there = run_campaign(folder, *arguments, status=0)
         rig.terminate()
-        rig.communicate(timeout=60.0)
+        rig.communicate(timeout=PATIENCE_S)
     assert [(case["outcome"], case["reason"]) for case in there["cases"]] == [
         ("passed", ""),
         ("skipped", "the existing rig has scene stable-run, not hammer"),

@@ -41,13 +41,13 @@ class Bench:
 
     def __init__(self, stack: ExitStack, child: subprocess.Popen[str], endpoint: str) -> None:
         self.child, self.endpoint = child, endpoint
-        self._client = stack.enter_context(ZenohClient(self.endpoint, wait_s=10.0))
+        self._client = stack.enter_context(ZenohClient(self.endpoint, wait_s=PATIENCE_S))
         self._stack = stack
         self.nodes(0)
         self.nodes(0, "can1")
 
     def status(self, channel: str = "can0") -> dict[str, Any]:
-        return json.loads(self._client.request(codec.request_key(channel, "status"), timeout_s=10.0))
+        return json.loads(self._client.request(codec.request_key(channel, "status"), timeout_s=PATIENCE_S))
 
     def nodes(self, count: int, channel: str = "can0") -> None:
         until(lambda: len(self.status(channel)["nodes"]) == count, of=self.child)
@@ -129,7 +129,7 @@ def test_stock_logger_and_player_keep_every_frame(hub: Bench, tmp_path: Path) ->
     hub.nodes(1)
     sender = hub.bus()
     for item in make_messages(count):
-        sender.send(item, timeout=10.0)
+        sender.send(item, timeout=PATIENCE_S)
     until(lambda: hub.status()["counts"]["frames"] - before["frames"] == count)
 
     def has_all() -> bool:
@@ -247,7 +247,7 @@ def test_a_stalled_or_killed_endpoint_does_not_delay_others(hub: Bench, how: sig
                 )
                 for number in range(first, first + 100)
             ]
-            sender.send_records(codec.make_records(rows), timeout=10.0)
+            sender.send_records(codec.make_records(rows), timeout=PATIENCE_S)
             while (item := receiver.recv(0)) is not None:
                 found.append(item)
         found += take(receiver, count - len(found))

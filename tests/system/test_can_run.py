@@ -113,7 +113,7 @@ class InProcess:
     def __exit__(self, *_: object) -> None:
         self._service.stop()
         for thread in self._threads:
-            thread.join(timeout=60.0)
+            thread.join(timeout=PATIENCE_S)
         self.gateway.close()
         self.read()
         self.bus.shutdown()
@@ -219,8 +219,8 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path) -> None:
                     console.stop()
                 if message.arbitration_id == TABLE.by_name["Event"].identifier and message.data[0] == 7:
                     break
-            recorder.join(timeout=60.0)
-        output, errors = child.communicate(timeout=60.0)
+            recorder.join(timeout=PATIENCE_S)
+        output, errors = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 0, errors
     sent = sum(len(rows) for rows in frames.values())
     assert int(output.rpartition("CAN: ")[2].split()[0]) >= sent

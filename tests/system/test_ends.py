@@ -39,7 +39,7 @@ def test_a_slow_subscriber_does_not_delay_the_end(mode: str) -> None:
     endpoint = free_endpoint()
     with command("run", "stable-run", "--listen", endpoint) as rig:
         read_line(rig, "listening on")
-        with start_python("-c", SLOW, endpoint, mode) as slow, ZenohClient(endpoint, wait_s=5.0) as client:
+        with start_python("-c", SLOW, endpoint, mode) as slow, ZenohClient(endpoint, wait_s=PATIENCE_S) as client:
             assert slow.stdout is not None
             assert slow.stdout.readline() == "ready\n"
 
@@ -49,7 +49,7 @@ def test_a_slow_subscriber_does_not_delay_the_end(mode: str) -> None:
             until(stalled, of=rig)
             begin = time.monotonic()
             rig.send_signal(signal.SIGTERM)
-            output, _ = rig.communicate(timeout=30.0)
+            output, _ = rig.communicate(timeout=PATIENCE_S)
             seconds = time.monotonic() - begin
     assert rig.returncode == 0
     assert "stopped at" in output
@@ -76,7 +76,7 @@ def test_a_signal_at_any_time_ends_a_rig_in_good_order(number: signal.Signals, i
     with command(*arguments, preexec_fn=ignoring) as rig:
         read_line(rig, words)
         rig.send_signal(number)
-        output, errors = rig.communicate(timeout=60.0)
+        output, errors = rig.communicate(timeout=PATIENCE_S)
     assert "Traceback" not in errors
     if deaf:
         assert rig.returncode == 0
@@ -103,7 +103,7 @@ def test_every_connected_client_gets_a_reply() -> None:
         with ZenohClient(endpoint, wait_s=PATIENCE_S) as client:
             assert wire.decode_document(client.request(wire.STATUS, timeout_s=PATIENCE_S))["state"] == "running"
         rig.terminate()
-        output, _ = rig.communicate(timeout=60.0)
+        output, _ = rig.communicate(timeout=PATIENCE_S)
     assert rig.returncode == 0, output
 
 
@@ -126,18 +126,18 @@ with zenoh.open(config) as session:
     with command("run", "stable-run", "--listen", endpoint) as rig:
         read_line(rig, "listening on")
         stamps: list[float] = []
-        with ZenohClient(endpoint, wait_s=5.0) as client:
+        with ZenohClient(endpoint, wait_s=PATIENCE_S) as client:
             client.subscribe(wire.STATUS, lambda *_: stamps.append(time.monotonic()))
             until(lambda: bool(stamps), of=rig)
             with start_python("-c", flood, endpoint, stdin=subprocess.PIPE) as hostile:
                 assert hostile.stdout is not None
                 assert hostile.stdout.readline().startswith("sent in")
                 begin = time.monotonic()
-                reply = json.loads(client.request(wire.STATUS, timeout_s=2.0))
+                reply = json.loads(client.request(wire.STATUS, timeout_s=PATIENCE_S))
                 assert reply["state"] == "running"
                 until(lambda: stamps[-1] > begin + 1.0, of=rig)
                 rig.terminate()
-                output, _ = rig.communicate(timeout=60.0)
+                output, _ = rig.communicate(timeout=PATIENCE_S)
     assert rig.returncode == 0
     assert max(b - a for a, b in itertools.pairwise(stamps)) < 2.0, "twice a second, but for a busy machine"
     found = re.search(r"blocks dropped (\d+), commands accepted (\d+)", output)

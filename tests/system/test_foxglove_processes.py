@@ -11,6 +11,7 @@ import pytest
 
 from tests.foxglove_client import FoxgloveClient
 from tests.processes import start_rig
+from tests.waiting import PATIENCE_S
 
 pytest.importorskip("foxglove")
 pytestmark = pytest.mark.wallclock
@@ -34,6 +35,6 @@ def test_a_recording_is_played_by_the_play_bar(tmp_path: Path) -> None:
             assert client.play(command=0, rate=1.0, seek_ns=None, request="play")["status"] == 0
             client.until(lambda: client.messages.get(topic))
         child.send_signal(signal.SIGTERM)
-        _, error = child.communicate(timeout=60.0)
+        _, error = child.communicate(timeout=PATIENCE_S)
         assert (child.returncode, "Traceback" in error) == (0, False), error
         assert "rig: the recording was cut off" in error

@@ -103,13 +103,13 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
             with pytest.raises((StreamEndedError, ConnectionError)):
                 read_on(proximity)
             proximity.close()
-            _, errors = child.communicate(timeout=20.0)
+            _, errors = child.communicate(timeout=PATIENCE_S)
             assert child.returncode == 0, errors
             assert "Traceback" not in errors
         status = Console(client, timeout_s=PATIENCE_S).status()
         assert (status["state"], status["queue"]["dropped"]) == ("running", 0)
         rig.send_signal(signal.SIGTERM)
-        rig.communicate(timeout=60.0)
+        rig.communicate(timeout=PATIENCE_S)
         assert rig.returncode == 0
 
 
@@ -123,7 +123,7 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
 )
 def test_errors_are_one_line(arguments: tuple[str, ...], message: str) -> None:
     with start_twins(*arguments) as (child, _):
-        _, errors = child.communicate(timeout=60.0)
+        _, errors = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 2
     assert errors.startswith(message)
     assert errors.count("\n") == 1

@@ -63,7 +63,7 @@ def run_devices(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
         processes.start_python("-c", DEVICE, f"zenoh:{endpoint}", str(slow_s)) as guard,
         processes.start_python("-I", SOCKET_DEVICE, str(port)) as plain,
     ):
-        joined = [machine.event("device", timeout_s=60.0) for _ in range(2)]
+        joined = [machine.event("device", timeout_s=PATIENCE_S) for _ in range(2)]
         assert {event["device"]: (event["state"], event["tick"]) for event in joined} == {
             "guard": ("joined", 0),
             "CAN 7": ("joined", 0),
@@ -73,7 +73,7 @@ def run_devices(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
         assert machine.step(200_000).lost == {}
         outputs = []
         for device in (guard, plain):
-            output, errors = device.communicate(timeout=30.0)
+            output, errors = device.communicate(timeout=PATIENCE_S)
             assert errors == ""
             outputs.append(output)
         events = [machine.event(name) for name in ("speed", "device", "speed", "device")]
@@ -98,7 +98,7 @@ def test_devices_over_zenoh_and_can_react_at_the_same_ticks_at_any_speed() -> No
 
 def test_a_killed_device_is_reported_and_the_rig_continues() -> None:
     with bench() as (machine, endpoint), processes.start_python("-c", WAITS, f"zenoh:{endpoint}", "0.5") as device:
-        machine.event("device", timeout_s=60.0)
+        machine.event("device", timeout_s=PATIENCE_S)
         machine.step(10_000)
         device.kill()
         device.wait()
@@ -110,7 +110,7 @@ def test_a_killed_device_is_reported_and_the_rig_continues() -> None:
 
 def test_a_client_is_informed_that_the_rig_waits_for_a_device() -> None:
     with bench() as (machine, endpoint), processes.start_python("-c", WAITS, f"zenoh:{endpoint}", "60") as device:
-        machine.event("device", timeout_s=60.0)
+        machine.event("device", timeout_s=PATIENCE_S)
         device.send_signal(signal.SIGSTOP)
         with pytest.raises(NoReplyError, match=r"does not answer rig/command/step; the rig waits for a \(\d+ s\)$"):
             machine.step(10_000, timeout_s=1.0)

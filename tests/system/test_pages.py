@@ -28,6 +28,7 @@ import pytest
 import typer
 
 from tests.processes import COMPILE_S, ROOT
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.wallclock
 
@@ -76,7 +77,7 @@ class Running:
             with contextlib.suppress(subprocess.TimeoutExpired):  # it may be about to end with the rig
                 self.process.wait(2.0)
             self.process.send_signal(signal.SIGINT)
-        status = self.process.wait(60.0)
+        status = self.process.wait(PATIENCE_S)
         self.log.close()
         assert status == self.status, f"{self.line}\n{self.said()}"
 

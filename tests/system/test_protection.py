@@ -27,12 +27,12 @@ def run_until_trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
         url = f"zenoh:{endpoint}"
         with rig.connect(url, channels=["disk_x", "disk_y", "speed"], wait_s=PATIENCE_S) as machine:
             with processes.start_python("-m", "drivers.protection", url, *OPTIONS) as device:
-                assert machine.event("device", timeout_s=60.0)["state"] == "joined"
+                assert machine.event("device", timeout_s=PATIENCE_S)["state"] == "joined"
                 rows = [machine.advance(0.1)]
                 machine.hammer(force_n=120.0, direction=30.0)
                 rows.append(machine.advance(0.4))
                 machine.stop()
-                output, errors = device.communicate(timeout=30.0)
+                output, errors = device.communicate(timeout=PATIENCE_S)
                 assert (device.returncode, errors) == (0, "")
             lines = output.splitlines()[1:]
             # A note at its start, one for each line, and the trip's command.
@@ -53,7 +53,7 @@ def test_a_monitor_whose_trip_is_refused_reports_it_and_monitors_to_the_end(tran
             rig.connect(f"zenoh:{endpoint}", channels=["disk_x"], wait_s=PATIENCE_S) as machine,
             processes.start_python("-m", "drivers.protection", url, *options) as device,
         ):
-            assert machine.event("device", timeout_s=60.0)["state"] == "joined"
+            assert machine.event("device", timeout_s=PATIENCE_S)["state"] == "joined"
             machine.advance(0.5)
             assert machine.lost == {}, "it still takes part"
             notes = [machine.event("note")["tags"][-1]]
@@ -61,7 +61,7 @@ def test_a_monitor_whose_trip_is_refused_reports_it_and_monitors_to_the_end(tran
                 notes.append(machine.event("note")["tags"][-1])
             assert "trip" in notes, "it is reported first"
             machine.stop()
-            output, errors = device.communicate(timeout=60.0)
+            output, errors = device.communicate(timeout=PATIENCE_S)
     assert (device.returncode, errors) == (0, "")
     assert "trip-refused  speed" in output
 

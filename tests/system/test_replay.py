@@ -70,13 +70,13 @@ def start_player(path: Path, clock: RealTime | FreeRun, **options: Any) -> Itera
             yield player, endpoint
         finally:
             player.stop()
-            thread.join(30.0)
+            thread.join(PATIENCE_S)
 
 
 @pytest.mark.parametrize("clock", [RealTime, FreeRun])
 def test_a_recording_of_a_replay_is_identical_byte_for_byte(path: Path, tmp_path: Path, clock: type[FreeRun]) -> None:
     again = tmp_path / "again.mcap"
-    with start_player(path, clock()) as (_, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
+    with start_player(path, clock()) as (_, endpoint), ZenohClient(endpoint, wait_s=PATIENCE_S) as client:
         RecordingSession(client, again, name="recorder").run()
     assert group_by_key(_payloads(again)) == group_by_key(generate_payloads())
     first, second = Recording.open(path), Recording.open(again)
@@ -97,7 +97,7 @@ def test_a_daq_gets_every_row_of_a_burst(path: Path) -> None:
     # Capacity far below the recording: the reader must wait for it.
     with (
         start_player(path, FreeRun()) as (_, endpoint),
-        Daq.open(f"zenoh:{endpoint}", buffer_s=0.1, wait_s=10.0) as daq,
+        Daq.open(f"zenoh:{endpoint}", buffer_s=0.1, wait_s=PATIENCE_S) as daq,
     ):
         got = list(daq.blocks(1000))
         assert (got[0].index, sum(map(len, got))) == (0, 200 * BLOCKS)
@@ -109,7 +109,10 @@ def test_a_daq_gets_every_row_of_a_burst(path: Path) -> None:
 def test_passes_without_end_have_consecutive_rows_for_a_daq(path: Path) -> None:
     passes = 5
     options = {"part": Part(loops=None), "renumber": True}
-    with start_player(path, FreeRun(), **options) as (_, endpoint), Daq.open(f"zenoh:{endpoint}", wait_s=10.0) as daq:
+    with (
+        start_player(path, FreeRun(), **options) as (_, endpoint),
+        Daq.open(f"zenoh:{endpoint}", wait_s=PATIENCE_S) as daq,
+    ):
         rows = 200 * BLOCKS * passes
         got = [daq.read(1000) for _ in range(rows // 1000)]
         assert [samples.index for samples in got] == list(range(0, rows, 1000))
@@ -119,7 +122,7 @@ def test_passes_without_end_have_consecutive_rows_for_a_daq(path: Path) -> None:
 
 def test_two_replays_at_one_endpoint_are_refused(path: Path) -> None:
     with start_player(path, RealTime()) as (_, endpoint), command("replay", str(path), "--listen", endpoint) as child:
-        _, errors = child.communicate(timeout=30.0)
+        _, errors = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 2
     assert errors.count("\n") == 1
     assert errors.startswith("rig: ")
@@ -169,7 +172,7 @@ def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
         console.rate(0.01)
         console.resume()
         console.stop()
-        output, _ = child.communicate(timeout=30.0)
+        output, _ = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 0
     assert output.startswith("replay: stopped at 0.5")
 
@@ -184,7 +187,7 @@ def test_ctrl_c_ends_the_stream_with_a_message(path: Path) -> None:
         client.settle()  # the status uses another link
         until(lambda: Console(client).status()["state"] == "running", of=child)
         child.send_signal(signal.SIGINT)
-        output, errors = child.communicate(timeout=30.0)
+        output, errors = child.communicate(timeout=PATIENCE_S)
         until(lambda: bool(events))
     assert child.returncode == 0
     assert "replay: stopped" in output

@@ -61,7 +61,7 @@ def test_ctrl_c_ends_the_run_in_good_order(number: signal.Signals) -> None:
             console = Console(client, timeout_s=PATIENCE_S)
             until(lambda: console.status()["tick"] > 0, of=child)
             child.send_signal(number)
-            output, errors = child.communicate(timeout=60.0)
+            output, errors = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 0, errors
     assert "scene stable-run: stopped at" in output
     assert "Traceback" not in errors

@@ -21,6 +21,7 @@ from recorder.viewer import window
 from recorder.viewer.window import Window, WindowError, environment, free_port
 from tests.processes import ROOT, free_endpoint, read_line, start_python
 from tests.unit.viewer_recording import Saved, Synthetic, generate_messages, make_replies
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.wallclock
 
@@ -121,9 +122,9 @@ def test_live_view_until_the_rig_ends(tmp_path: Path) -> None:
         rig(duration_s=2.0) as (server, port),
         start_process([*VIEW, "--live", "--connect", f"127.0.0.1:{port}", "--save", str(target)]) as viewer,
     ):
-        out, _ = viewer.communicate(timeout=60)
+        out, _ = viewer.communicate(timeout=PATIENCE_S)
         assert (viewer.returncode, out) == (0, "the rig ended: completed\n")
-        output = server.communicate(timeout=30)[0]
+        output = server.communicate(timeout=PATIENCE_S)[0]
     beats = re.findall(r'rig/clients/viewer .*"received_index":(\d+)', output)
     assert beats
     # The table of contents of a file grows in memory until its end, so a live view writes none.
@@ -144,7 +145,7 @@ def test_live_view_notices_that_the_rig_was_killed(tmp_path: Path) -> None:
     ):
         read_line(server, "rig/clients/viewer")
         server.send_signal(signal.SIGKILL)
-        out, _ = viewer.communicate(timeout=60)
+        out, _ = viewer.communicate(timeout=PATIENCE_S)
     assert viewer.returncode == 1
     assert out.startswith("the rig disappeared without ending its stream")
     assert Saved(target)["/events", "TextLog:level"].values[-1] == ["WARN"]
@@ -157,11 +158,11 @@ def test_the_web_viewer_uses_loopback_only_and_ends_with_the_command(recorded: P
         address = re.search(r"http://127\.0\.0\.1:\d+/\S*", read_line(viewer, "http://"))
         assert address is not None
         assert len(address[0]) <= 30
-        with urllib.request.urlopen(address[0], timeout=10) as page:
+        with urllib.request.urlopen(address[0], timeout=PATIENCE_S) as page:
             assert page.status == 200
             assert "notebook=1" in page.url
             assert b"viewer_state()" in page.read()
-        with urllib.request.urlopen(f"{address[0]}re_viewer.js", timeout=10) as code:
+        with urllib.request.urlopen(f"{address[0]}re_viewer.js", timeout=PATIENCE_S) as code:
             assert (
                 b"viewer_state()" in code.read()
             )  # the function that the page's script calls, in the installed version
@@ -178,10 +179,10 @@ def test_the_web_viewer_uses_loopback_only_and_ends_with_the_command(recorded: P
             assert child.environ().get("CI") == "true"
             assert os.getpgid(child.pid) != os.getpgid(viewer.pid)
         viewer.send_signal(signal.SIGTERM)
-        out, _ = viewer.communicate(timeout=30)
+        out, _ = viewer.communicate(timeout=PATIENCE_S)
         assert viewer.returncode == 0
         assert "Traceback" not in out
-        _, alive = psutil.wait_procs(children, timeout=10)
+        _, alive = psutil.wait_procs(children, timeout=PATIENCE_S)
         assert [child for child in alive if child.status() != psutil.STATUS_ZOMBIE] == []
 
 

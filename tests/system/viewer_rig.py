@@ -9,6 +9,7 @@ import time
 from rig.base import wire
 from rig.serve.transport.zenoh import ZenohServer
 from tests.unit.viewer_recording import Synthetic, generate_messages, make_replies
+from tests.waiting import PATIENCE_S
 
 
 def main(port: int, duration_s: float) -> None:
@@ -27,7 +28,7 @@ def main(port: int, duration_s: float) -> None:
         server.subscribe_reports(f"{wire.CLIENTS}/*", subscribe_reports)
         server.announce()
         print("ready", flush=True)
-        met.wait(60.0)
+        met.wait(PATIENCE_S)
         start = time.monotonic()
         for number, block in enumerate(blocks):
             time.sleep(max(0.0, start + 0.01 * number - time.monotonic()))

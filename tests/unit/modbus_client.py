@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 import struct
 
+from tests.waiting import PATIENCE_S
+
 
 class ModbusError(Exception):
     """The server answered with an exception code."""
@@ -14,7 +16,7 @@ class ModbusClient:
     """Client of one connection; numbers are big-endian."""
 
     def __init__(self, port: int) -> None:
-        self.link = socket.create_connection(("127.0.0.1", port), timeout=30.0)
+        self.link = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
         self._transaction = 0
 
     def __enter__(self) -> ModbusClient:

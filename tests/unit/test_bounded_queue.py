@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 
 from rig.serve.waiting import BoundedQueue, take_first
+from tests.waiting import PATIENCE_S
 
 
 def test_a_full_queue_refuses_drops_the_oldest_or_waits() -> None:
@@ -30,7 +31,7 @@ def test_a_wait_for_room_or_an_item_ends() -> None:
     assert queue.put(2, 10.0)
     assert queue.wait_for_room(10.0)
     queue.close()
-    reader.join(10.0)
+    reader.join(PATIENCE_S)
     assert items == [1, 2, None]
 
 

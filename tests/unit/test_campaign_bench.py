@@ -35,6 +35,7 @@ from rig.base import wire
 from rig.base.errors import InputError, RefusedError
 from rig.base.outcome import InconclusiveError
 from tests.processes import ROOT
+from tests.waiting import PATIENCE_S
 
 DEFAULT_TARGET = Target()
 PARTS = {
@@ -190,7 +191,7 @@ def test_changes_of_the_files_of_a_device_are_noted(tmp_path: Path) -> None:
         )  # fmt: skip
         assert device.program.command == ["python", "tool.py", "print('guard u {danger}')"]
         assert device.digests["tool.py"] == hashlib.sha256(change.encode()).hexdigest()
-        assert device.program.wait(60.0) == 0
+        assert device.program.wait(PATIENCE_S) == 0
         with pytest.raises(BenchError, match="device guard ended with status 0: nothing"):
             device.check_running()
         by_test = not change

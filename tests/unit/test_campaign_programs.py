@@ -14,6 +14,7 @@ from replays.campaigns.files.case_results import CaseRecording
 from rig.base.errors import DiskError, InputError
 from tests import waiting
 from tests.processes import ROOT
+from tests.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.wallclock]
 CHILD = """
@@ -54,7 +55,7 @@ def test_a_child_in_a_session_of_its_own_ends_with_its_program(tmp_path: Path, m
     waiting.until((tmp_path / "child").exists)
     if status == 137 and "getppid" not in more:
         program.kill()
-    assert program.wait(60.0) == status
+    assert program.wait(PATIENCE_S) == status
     program.end()
     waiting.until(lambda: not is_running(int((tmp_path / "child").read_text())))
 
@@ -66,7 +67,7 @@ def test_status_and_lines_of_a_program(tmp_path: Path) -> None:
     ):  # fmt: skip
         program, calls = start(tmp_path, code), list[int]()
         program.before_end = lambda calls=calls: calls.append(1)
-        assert program.wait(60.0) == status
+        assert program.wait(PATIENCE_S) == status
         assert program.last_line == line
         assert program.wait_for("two", 60.0) == ("two words" if line != "nothing" else None)
         assert not program.is_output_cut
@@ -74,7 +75,7 @@ def test_status_and_lines_of_a_program(tmp_path: Path) -> None:
             program.end()
         assert (calls, program.is_ended) == ([1], True)
     missing = Program(["./nothing"], tmp_path / "program.log", folder=tmp_path)
-    assert (missing.wait(60.0), missing.last_line) == (127, "./nothing: No such file or directory")
+    assert (missing.wait(PATIENCE_S), missing.last_line) == (127, "./nothing: No such file or directory")
     missing.end()
     with pytest.raises(DiskError, match="could not be started"):
         Program(["./nothing"], tmp_path / "none/program.log", folder=tmp_path)
@@ -83,7 +84,7 @@ def test_status_and_lines_of_a_program(tmp_path: Path) -> None:
 def test_output_is_bounded_and_read_although_the_file_was_replaced(tmp_path: Path) -> None:
     code = "import os, sys; os.unlink('program.log'); sys.stdout.write('x' * 100 + '\\n')"
     program = Program([sys.executable, "-c", code], tmp_path / "program.log", folder=tmp_path, output_bytes=60)
-    assert program.wait(60.0) == 0
+    assert program.wait(PATIENCE_S) == 0
     program.end()
     assert program.is_output_cut
     assert program.read_output() == "x" * 60 + "\n41 more bytes of output were dropped\n"

@@ -40,7 +40,7 @@ from rig.serve.service import Service
 from rig.serve.transport.fanout import Fanout
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, FakeSimulation
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
 TABLE = default_messages()
@@ -131,7 +131,7 @@ class Setup:
         self.thread.start()
 
     def join(self) -> None:
-        self.thread.join(timeout=30.0)
+        self.thread.join(timeout=PATIENCE_S)
         assert not self.thread.is_alive()
 
 
@@ -239,6 +239,10 @@ def test_absent_channels_are_marked() -> None:
         until(lambda: len(setup.tap.of("Samples_5")) == 50 and len(setup.tap.of("Hammer")) == 25)
     assert not setup.tap.of("Probes")
     assert not setup.tap.of("Samples_1")
+    clock, sent = setup.tap.decoded("Clock")[0], {frame.arbitration_id for frame in setup.tap.frames}
+    for layout in ("fd", "classic"):
+        found = sum(row.identifier in sent for row in getattr(TABLE, layout) if row.samples)
+        assert clock[f"{layout}_messages"] == found > 1
     _, values = samples_of(setup.tap, "Samples_2")
     assert set(values[:, 0]) == {ABSENT}
     assert set(values[:, 1]) == {0, 1, 2, 3}
@@ -509,7 +513,7 @@ class SilentRig(MemoryClient):
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         if key.startswith(wire.COMMAND):
-            self.go.wait(10.0)
+            self.go.wait(PATIENCE_S)
         return super().request(key, payload, timeout_s=timeout_s)
 
 

@@ -325,7 +325,7 @@ def test_a_full_transmit_queue_blocks_or_raises_and_can_be_flushed(way: str) -> 
         with pytest.raises(can.CanOperationError, match=r"transmit queue of can0 is full: 51[0-2] frames wait"):
             fill(sender)
         # One frame takes 8 ms here.
-        sender.send(message(0x100), timeout=5.0)
+        sender.send(message(0x100), timeout=PATIENCE_S)
         sender.flush_tx_buffer()
         sender.send(message(0x300), timeout=0.5)
         found = []

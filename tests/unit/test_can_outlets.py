@@ -40,7 +40,7 @@ from rig.cli.connections.can_output import CanOptions, CanOutput
 from rig.cli.groups import expand_groups
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.processes import free_endpoint
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
 
@@ -85,7 +85,7 @@ class Text:
         self.socket = socket.socket()
         # A small buffer, so that unread data is noticed soon.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        self.socket.settimeout(5.0)
+        self.socket.settimeout(PATIENCE_S)
         self.socket.connect((server.host, server.port))
         self.seen = ""
 
@@ -357,7 +357,7 @@ def test_a_stalled_client_is_dropped_while_others_receive_all_frames() -> None:
         assert stalled.ask("< open can0 >") == "< ok >"
         assert stalled.ask("< rawmode >") == "< ok >"
         sent = got = 0
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + PATIENCE_S
         while server.counts()["given_up"] == 0 and time.monotonic() < deadline:
             for _ in range(20):
                 other.send(message(0x100, sent.to_bytes(8, "big")))
@@ -377,7 +377,7 @@ def test_a_client_that_reads_no_replies_is_no_longer_served() -> None:
     with bench.stack:
         server = bench.serve(room=100, patience_s=0.3)
         client = bench.raw(server)
-        client.socket.settimeout(10.0)
+        client.socket.settimeout(PATIENCE_S)
         with contextlib.suppress(ConnectionError):
             for _ in range(100_000):
                 client.send("< echo >" * 1000)
@@ -605,10 +605,10 @@ def test_a_program_that_stops_reading_loses_frames_and_its_channel(hub_bench: Be
     other, port = hub_bench.bus(), hub_bench.port(room=50, patience_s=0.3)
     with Terminal(port) as terminal:
         terminal.ask("O")
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + PATIENCE_S
         while port.figures()["given_up"] == 0 and time.monotonic() < deadline:
             for _ in range(100):
-                other.send(CLASSIC[2], timeout=5.0)
+                other.send(CLASSIC[2], timeout=PATIENCE_S)
             time.sleep(0.02)
         figures = port.figures()
         assert (figures["given_up"], figures["open"]) == (1, 0)
@@ -749,14 +749,14 @@ def test_messages_are_bounded_and_never_split_by_short_reads() -> None:
                 with contextlib.suppress(BlockingIOError):
                     received += theirs.recv(turn.randrange(1, 600), socket.MSG_DONTWAIT)
         assert 50 <= len(kept) < 400
-        theirs.settimeout(5.0)
+        theirs.settimeout(PATIENCE_S)
         while len(received) < len(b"".join(kept)):
             received += theirs.recv(333)
         assert received == b"".join(kept)
         theirs.sendall(b"<end>")
         assert theirs.recv(100) == b"<end>"
         theirs.close()
-        thread.join(5.0)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
@@ -777,7 +777,7 @@ def test_each_write_contains_complete_messages() -> None:
         assert all(each.startswith(b"< ") and each.endswith(b" >") and len(each) <= 1024 for each in writes)
         assert b"".join(writes) == b"".join(messages)
         outlet.stop()
-        thread.join(5.0)
+        thread.join(PATIENCE_S)
 
 
 def test_an_internal_error_of_a_port_is_reported_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

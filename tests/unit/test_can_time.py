@@ -140,6 +140,27 @@ def test_a_client_that_joins_after_a_clock_waits_for_the_next(name: str, raw: di
         source.wait()
 
 
+@pytest.mark.parametrize("last", ["Samples_2", None])
+def test_a_busy_machine_delays_the_samples_of_a_run_but_hides_none(
+    last: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.sources.can._SILENCE_TIMEOUT_S", 0.3)
+    with closing(CanSource("virtual:busy", wait_s=0.0 if last is None else PATIENCE_S)) as source:
+
+        def take(name: str, **raw: int) -> None:
+            row = default_messages().by_name[name]
+            source.take(row.identifier, row.encode(**raw))
+
+        take("Clock", classic_messages=2)
+        take("Rates", **RATES)
+        take("Sync", index=0, time=0)
+        take("Samples_1", index=0)
+        late = threading.Timer(0.5, take, (last,), {"index": 0})
+        if last is not None:
+            late.start()
+        assert list(source.streams()) == ["Samples_1", last][: 1 if last is None else 2]
+
+
 def test_an_index_is_the_nearest_with_its_low_32_bits() -> None:
     wrap = 1 << 32
     for index, near in ((7, 0), (wrap + 5, wrap - 5), (wrap - 5, wrap + 5), (3 * wrap, 3 * wrap + wrap // 4)):

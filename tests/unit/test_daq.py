@@ -40,6 +40,7 @@ from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint, start_python
 from tests.unit.instruments_fake import BLOCK, FakeRig, expected_values, make_counts
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.wallclock
 _numbers = itertools.count()
@@ -248,7 +249,7 @@ def test_an_end_does_not_overtake_rows_being_delivered() -> None:
 
     def hold(_: wire.Block) -> None:
         on_the_way.set()
-        held.wait(5.0)
+        held.wait(PATIENCE_S)
 
     takes: dict[str, Any] = {}
     with MemoryServer(cache=10) as server, Threads(server) as client, MemoryClient(server) as keeper:
@@ -262,12 +263,12 @@ def test_an_end_does_not_overtake_rows_being_delivered() -> None:
         rig.end()
         threads = [threading.Thread(target=takes[key], args=each) for each in sent.items() for key in each[:1]]
         threads[0].start()
-        assert on_the_way.wait(5.0)
+        assert on_the_way.wait(PATIENCE_S)
         threads[1].start()
         threads[1].join(0.2)
         held.set()
         for thread in threads:
-            thread.join(5.0)
+            thread.join(PATIENCE_S)
     assert received == [BLOCK, "the rig's run has ended: completed"]
 
 
@@ -315,7 +316,7 @@ def test_a_rig_that_is_killed_raises_in_the_program_that_waits_for_its_function(
         rig.publish("forces")
         rig.server.close()
         with pytest.raises(RigLostError, match="the link to the rig is lost"):
-            daq.wait(timeout_s=10.0)
+            daq.wait(timeout_s=PATIENCE_S)
     assert sum(map(len, taken)) == BLOCK
 
 
@@ -325,7 +326,7 @@ def test_a_function_is_called_with_each_block() -> None:
         daq.call(blocks.append, rows=BLOCK)
         rig.publish(*GROUPS, blocks=5)
         rig.end()
-        assert daq.wait(timeout_s=10.0)
+        assert daq.wait(timeout_s=PATIENCE_S)
     np.testing.assert_allclose(np.concatenate([each.values for each in blocks]), expected(0, 5 * BLOCK), atol=1e-9)
 
 
@@ -334,7 +335,7 @@ def test_an_exception_of_the_function_is_raised_again() -> None:
         daq.call(lambda samples: 1 / 0)
         rig.publish(*GROUPS)
         with pytest.raises(ZeroDivisionError):
-            daq.wait(timeout_s=10.0)
+            daq.wait(timeout_s=PATIENCE_S)
 
 
 def test_asyncio_waits_without_holding_the_loop() -> None:
@@ -481,7 +482,7 @@ def test_a_bus_that_falls_silent_raises(monkeypatch: pytest.MonkeyPatch) -> None
         gateway.close()
         rows: list[int] = []
         with pytest.raises(RigLostError, match="the link to the rig is lost"):
-            rows.extend(map(len, daq.blocks(timeout_s=5.0)))
+            rows.extend(map(len, daq.blocks(timeout_s=PATIENCE_S)))
         assert sum(rows) == 200
 
 
@@ -501,7 +502,7 @@ def test_a_restarted_rig_on_a_bus_is_another_rig(state: RigState) -> None:
         source.send(0x20, bytes(8))
         bus.send(can.Message(arbitration_id=heartbeat.identifier, data=sent, is_extended_id=False))
         with pytest.raises(RigLostError, match="the link to the rig is lost"):
-            list(daq.blocks(timeout_s=20.0))
+            list(daq.blocks(timeout_s=PATIENCE_S))
         with pytest.raises(RigLostError):
             source.send(0x20, bytes(8))
 
@@ -509,7 +510,7 @@ def test_a_restarted_rig_on_a_bus_is_another_rig(state: RigState) -> None:
 def test_the_end_of_a_run_is_sent_on_the_bus() -> None:
     with on_can(Schedule(classic_hz=1000), channels=["P_N"]) as (rig, daq, gateway):
         rig.end()
-        assert sum(map(len, daq.blocks(timeout_s=5.0))) == 200
+        assert sum(map(len, daq.blocks(timeout_s=PATIENCE_S))) == 200
         with pytest.raises(StreamEndedError, match="the rig's run has ended"):
             daq.read()
         gateway.close()
@@ -559,7 +560,7 @@ def test_the_examples_are_short_and_all_run_here() -> None:
 def test_an_example_without_a_rig_prints_one_line() -> None:
     file = Path(drivers.examples.__file__).with_name("callback.py")
     with start_python(str(file), f"zenoh:{free_endpoint()}") as child:
-        output, complaints = child.communicate(timeout=60.0)
+        output, complaints = child.communicate(timeout=PATIENCE_S)
     assert (child.returncode, output, complaints.count("\n")) == (2, "", 1)
     assert complaints.startswith("no rig answers at 127.0.0.1:")
     assert "start one with: rig run" in complaints

@@ -35,6 +35,7 @@ from drivers.daqmx.tasks.task import Task
 from rig.base import wire
 from rig.channels.table import default_table
 from rig.serve.waiting import wait_until
+from tests.waiting import PATIENCE_S
 
 from .recorder_stream import ScriptedClient, make_block
 
@@ -180,7 +181,7 @@ def test_finite_acquisition_ends(rig: PlayedRig, analog: Callable[..., nidaqmx.T
     with refused(DAQmxErrors.WAIT_UNTIL_DONE_DOES_NOT_INDICATE_DONE):
         task.wait_until_done(timeout=0.0)
     rig.send(0, 1, 2, 3)
-    task.wait_until_done(timeout=10.0)
+    task.wait_until_done(timeout=PATIENCE_S)
     assert len(task.read(nidaqmx.constants.READ_ALL_AVAILABLE)) == 300
     with refused(DAQmxErrors.SAMPLES_WILL_NEVER_BE_AVAILABLE):
         task.read(1)
@@ -351,7 +352,7 @@ def test_a_clocked_output_that_is_stopped_early_leaves_no_thread(rig: PlayedRig)
         port.start()
         generator = next(thread for thread in threading.enumerate() if "_generate" in thread.name)
         port.stop()
-        generator.join(10.0)
+        generator.join(PATIENCE_S)
         assert not generator.is_alive()
 
 
@@ -370,7 +371,7 @@ def test_calls_beyond_the_limit_are_refused_and_do_not_wait(task: nidaqmx.Task, 
             return bool(task.name)
         return False
 
-    assert wait_until(is_served, 10.0)
+    assert wait_until(is_served, PATIENCE_S)
 
 
 @pytest.mark.parametrize(
@@ -523,7 +524,7 @@ def test_clocked_outputs_write_their_samples_at_the_clock(rig: PlayedRig, wavefo
         assert not rig.commands
         port.start()
         rig.send(0)
-        wait_until(lambda: len(rig.commands) == 2, 10.0)
+        wait_until(lambda: len(rig.commands) == 2, PATIENCE_S)
         with refused(DAQmxErrors.WAIT_UNTIL_DONE_DOES_NOT_INDICATE_DONE):
             port.wait_until_done(0.0)
         rig.send(1)
@@ -601,6 +602,6 @@ def test_events_report_samples_and_the_end(rig: PlayedRig, task: nidaqmx.Task) -
     task.register_done_event(lambda _, status, __: done.set() or 0)
     task.start()
     rig.send(0, 1)
-    assert done.wait(10.0)
-    assert wait_until(lambda: len(seen) == 4, 10.0)
+    assert done.wait(PATIENCE_S)
+    assert wait_until(lambda: len(seen) == 4, PATIENCE_S)
     assert seen == [100] * 4

@@ -27,7 +27,7 @@ from rig.serve.pacing import Lockstep
 from rig.serve.service import Service
 from rig.serve.stream_check import parse_event
 from rig.serve.transport.memory import MemoryClient, MemoryServer
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 SENSORS = {"groups": ["probes", "forces"]}
 
@@ -93,7 +93,7 @@ def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:
     console.clear()
     console.step(60_000)
     for thread in threads:
-        thread.join(30.0)
+        thread.join(PATIENCE_S)
     (summary,) = summaries
     assert (summary.malformed, summary.good) == (0, True)
     recording = Recording.open(tmp_path / "a.mcap")

@@ -23,6 +23,7 @@ from rig.run.simulation import Simulation
 from rig.serve.pacing import Lockstep
 from rig.serve.service import Service
 from rig.serve.transport.memory import MemoryClient, MemoryServer
+from tests.waiting import PATIENCE_S
 
 _LOW_RATES = {"sensors.truth_rate_hz": 500, "sensors.rate_hz": 5000}
 
@@ -111,7 +112,7 @@ def test_commands_from_before_and_during_a_live_recording(tmp_path: Path) -> Non
 
     def ask(name: str, **request: Any) -> dict[str, Any]:
         reply = wire.decode_document(
-            client.request(wire.command_key(name), wire.encode_document(request), timeout_s=30)
+            client.request(wire.command_key(name), wire.encode_document(request), timeout_s=PATIENCE_S)
         )
         assert reply["accepted"], reply
         return reply
@@ -127,8 +128,8 @@ def test_commands_from_before_and_during_a_live_recording(tmp_path: Path) -> Non
     ask("speed", speed_hz=5.0)
     ask("hammer", force_n=60.0, duration_ms=5.0, direction="-y")
     ask("step", ticks=350_000)
-    running.join(timeout=60)
-    recording_thread.join(timeout=60)
+    running.join(timeout=PATIENCE_S)
+    recording_thread.join(timeout=PATIENCE_S)
 
     recording = Recording.open(tmp_path / "live.mcap")
     experiment = Experiment.from_recording(recording)

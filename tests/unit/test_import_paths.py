@@ -12,6 +12,7 @@ import pytest
 
 import rig
 from rig.base import import_paths
+from tests.waiting import PATIENCE_S
 
 
 @pytest.mark.filterwarnings("ignore:(rig.(kernels|sensors)|drivers.force) is")
@@ -44,7 +45,7 @@ def run_script(folder: Path, code: str, script: str = "script.py") -> str:
     """Return the output of a script in a folder, or the last line of its error."""
     (folder / script).write_text(code)
     command = [sys.executable, str(folder / script)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     return done.stdout.strip() or done.stderr.splitlines()[-1]
 
 

@@ -284,10 +284,10 @@ def test_instruments_reconnect_to_a_restarted_rig() -> None:
         twins = closing.enter_context(Twins(closing.enter_context(ZenohClient(endpoint))))
         near, far = memory.make_pair()
         twins.serve(KINDS["force"], MessagePort(near, "memory:"))
-        force = closing.enter_context(Force(far, timeout_s=20.0))
+        force = closing.enter_context(Force(far, timeout_s=PATIENCE_S))
         force.start()
         with publishing(rig):
-            assert len(force.read(3 * BLOCK, timeout_s=20.0)) == 3 * BLOCK
+            assert len(force.read(3 * BLOCK, timeout_s=PATIENCE_S)) == 3 * BLOCK
         first.close()
         with pytest.raises(RigLostError, match="the link to the rig is lost"):
             read_on(force)
@@ -295,7 +295,7 @@ def test_instruments_reconnect_to_a_restarted_rig() -> None:
         until(lambda: answers(force))
         force.start()
         with publishing(rig):
-            samples = force.read(3 * BLOCK, timeout_s=20.0)
+            samples = force.read(3 * BLOCK, timeout_s=PATIENCE_S)
         np.testing.assert_allclose(samples.values, expected_values("forces", samples.index, len(samples)), atol=1e-9)
 
 
@@ -474,7 +474,7 @@ def test_random_bytes_crash_nothing(bench: Bench) -> None:
     noise = random.Random(11)
     link = bench.open_link("hammer")
     bench.closing.callback(link.close)
-    driver = Hammer(link, timeout_s=5.0)
+    driver = Hammer(link, timeout_s=PATIENCE_S)
     for _ in range(30):
         message = noise.randbytes(noise.randint(0, 60))
         if bench.link.startswith("can") and not message:
@@ -664,7 +664,7 @@ def test_an_unread_line_does_not_block_the_writer() -> None:
     with time_limit(PATIENCE_S), pytest.raises(LinkTimeoutError, match="accepted no data"):
         line.send(b"x" * 60_000, timeout_s=0.2)
     # A new reader is synchronised after the truncated frame.
-    reader = threading.Thread(target=lambda: line.send(b"last", timeout_s=5.0))
+    reader = threading.Thread(target=lambda: line.send(b"last", timeout_s=PATIENCE_S))
     reader.start()
     found = []
     while not found or found[-1] != b"last":

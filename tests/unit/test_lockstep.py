@@ -23,7 +23,7 @@ from rig.serve.pacing import FreeRun, Lockstep
 from rig.serve.transport.memory import MemoryClient
 from tests.unit.service_fake import FakeSimulation
 from tests.unit.test_service import BLOCK, Running
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 
 @contextmanager
@@ -41,7 +41,7 @@ class Steps:
         self._thread.start()
 
     def join(self) -> list[AcceptedStep]:
-        self._thread.join(20.0)
+        self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
         return self.replies
 
@@ -251,7 +251,7 @@ def test_a_stop_does_not_wait_for_devices() -> None:
         thread.start()
         device.wait(1)
         device.stop()
-        thread.join(20.0)
+        thread.join(PATIENCE_S)
         rig.join()
         assert rig.summary["reason"] == "stopped"
         assert "a run that ended: stopped" in str(caught[0])
@@ -326,7 +326,7 @@ def test_commands_of_two_devices_at_one_tick_are_ordered_by_name() -> None:
         assert rig.console.note("of nobody that has joined").id == 5
         assert numbers == []
         first.done(BLOCK)
-        thread.join(20.0)
+        thread.join(PATIENCE_S)
         assert numbers == [6, 7]
         assert steps.join()[0].lost == {}
     assert [event["request"] for event in rig.listener.named("command")[-2:]] == [{"speed_hz": 1.0}, {"speed_hz": 2.0}]
@@ -343,7 +343,7 @@ def commands_of(rig: Running) -> Iterator[Commands]:
         yield commands
     finally:
         commands.close()
-        thread.join(20.0)
+        thread.join(PATIENCE_S)
     assert not thread.is_alive()
 
 
@@ -401,7 +401,7 @@ def test_a_stop_that_a_device_has_announced_follows_its_notes() -> None:
         thread.start()
         with pytest.raises(RefusedError, match="a run that ended: stopped"):
             rig.console.step(BLOCK)
-        thread.join(20.0)
+        thread.join(PATIENCE_S)
     events = [(each["event"], each.get("text") or each["command"]) for each in rig.listener.events
               if each.get("from") == "CAN 7" and each["event"] != "device"]  # fmt: skip
     assert events == [("note", "danger"), ("note", "trip"), ("command", "stop")]
@@ -442,8 +442,8 @@ def test_a_stop_refuses_waiting_requests() -> None:
         speed = refused(lambda: second.speed(2.0))
         time.sleep(0.1)  # it comes, and waits
         rig.console.stop()
-        step.join(20.0)
-        speed.join(20.0)
+        step.join(PATIENCE_S)
+        speed.join(PATIENCE_S)
     assert len(caught) == 2
     assert all("a run that ended: stopped" in each for each in caught)
 

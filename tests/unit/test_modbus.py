@@ -25,6 +25,7 @@ from rig.base.errors import RefusedError
 from rig.channels.table import default_table
 from tests.processes import ROOT, free_port
 from tests.unit.modbus_client import ModbusClient, ModbusError
+from tests.waiting import PATIENCE_S
 
 SETTINGS = {"alert_um": 500.0, "danger_um": 1500.0}
 REGISTERS = RegisterMap(default_table())
@@ -230,7 +231,11 @@ def test_requests_sent_before_the_reply_are_answered_in_order() -> None:
 
 def test_a_request_waits_for_the_command_before_it() -> None:
     done = threading.Event()
-    with served(lambda _: done.wait(60.0)) as (port, _), ModbusClient(port) as client, ModbusClient(port) as other:
+    with (
+        served(lambda _: done.wait(PATIENCE_S)) as (port, _),
+        ModbusClient(port) as client,
+        ModbusClient(port) as other,
+    ):
         client.link.sendall(struct.pack(">HHHBBHH", 1, 0, 6, 17, 5, 0, 0xFF00))
         for _ in range(5):
             other.registers(0, 1)  # the server continues

@@ -18,6 +18,7 @@ from rig.serve.service import Service
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.recorder_stream import make_documents
 from tests.unit.service_fake import FakeSimulation
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.wallclock
 
@@ -51,8 +52,8 @@ def test_a_note_is_recorded_with_its_time_and_is_no_command(tmp_path: Path) -> N
         with pytest.raises(RefusedError, match=must):
             console.note(text, tags=tags)
     console.stop()
-    run.join(20.0)
-    recording.join(20.0)
+    run.join(PATIENCE_S)
+    recording.join(PATIENCE_S)
     events = [event for event in Recording.open(tmp_path / "run.mcap").events if event["event"] == "note"]
     assert len(events) == 1
     (note,) = events

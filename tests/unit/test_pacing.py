@@ -6,6 +6,7 @@ import threading
 import pytest
 
 from rig.serve.pacing import FreeRun, Histogram, Lockstep, RealTime, StepTimeoutError
+from tests.waiting import PATIENCE_S
 
 TICK_RATE = 1_000_000
 BLOCK = 10_000
@@ -146,7 +147,7 @@ def test_lockstep_counts_the_timeout_from_the_last_grant() -> None:
 
 @pytest.mark.wallclock
 def test_lockstep_wakes_a_waiting_thread() -> None:
-    clock = Lockstep(timeout_s=30.0)
+    clock = Lockstep(timeout_s=PATIENCE_S)
     clock.start(0, TICK_RATE)
     granted: list[int] = []
     thread = threading.Thread(target=lambda: granted.extend(clock.grant(BLOCK) for _ in range(2)))
@@ -155,7 +156,7 @@ def test_lockstep_wakes_a_waiting_thread() -> None:
     while not granted and thread.is_alive():
         thread.join(0.001)
     clock.allow(BLOCK)
-    thread.join(20.0)
+    thread.join(PATIENCE_S)
     assert granted == [0, BLOCK]
 
 

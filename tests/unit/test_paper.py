@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -46,6 +45,7 @@ from replays.studies.paper.statement import (
 from rig.cli.main import main
 from rig.physics.parameters import load_parameters
 from tests.commands import run_for_output
+from tests.waiting import until
 
 ASSUMPTIONS = {"hammer.duration", "hammer.at", "transducer.bandwidth"}
 """Assumptions of the report in addition to the parameters."""
@@ -340,10 +340,7 @@ def test_workers_end_when_their_parent_is_killed():
     killed = subprocess.run([sys.executable, "-c", _POOL], capture_output=True, text=True, timeout=120)
     workers = [int(number) for number in killed.stdout.split()]
     assert len(workers) == 2, killed.stderr
-    end = time.monotonic() + 20.0
-    while any(map(_lives, workers)):
-        assert time.monotonic() < end, workers
-        time.sleep(0.05)
+    until(lambda: not any(map(_lives, workers)))
 
 
 def _lives(process: int) -> bool:

@@ -39,7 +39,7 @@ from tests.unit.player_recording import (
 from tests.unit.recorder_stream import generate_stream, make_documents
 from tests.unit.service_fake import FakeSimulation
 from tests.unit.test_pacing import FakeTime
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 PROBES = wire.sensor_key("probes")
 
@@ -414,7 +414,7 @@ def running(track: Track, **options: Any) -> Iterator[tuple[Player, Received, Co
         yield player, played, Console(MemoryClient(server), name="a test")
     finally:
         player.stop()
-        thread.join(20.0)
+        thread.join(PATIENCE_S)
     assert not thread.is_alive()
 
 

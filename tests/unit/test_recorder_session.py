@@ -40,6 +40,7 @@ from rig.base.wire import (
 from rig.channels.table import default_table
 from rig.serve.transport import NoReplyError
 from rig.serve.transport.memory import MemoryClient, MemoryServer
+from tests.waiting import PATIENCE_S, until
 
 from .recorder_stream import ScriptedClient, generate_stream, make_block, make_documents
 
@@ -75,9 +76,7 @@ def record(
     """Run a session while another thread acts as the rig, as soon as the session has subscribed."""
 
     def wait_and_act() -> None:
-        deadline = time.monotonic() + 10.0
-        while STATUS not in client.subscribed and time.monotonic() < deadline:
-            time.sleep(0.002)
+        until(lambda: STATUS in client.subscribed, every_s=0.002)
         act()
 
     thread = threading.Thread(target=wait_and_act)
@@ -435,7 +434,7 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
     real, done = RecordingWriter.take, []
 
     def slow(self, payload: Payload) -> None:
-        gate.wait(10.0)
+        gate.wait(PATIENCE_S)
         real(self, payload)
         done.append(payload)
 
@@ -446,9 +445,8 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
         for block in blocks[:-1]:
             client.publish(*block)
         gate.set()
-        deadline = time.monotonic() + 10.0
         quiet = 0
-        while quiet < 100 and time.monotonic() < deadline:  # data being written also takes space
+        while quiet < 100:  # data being written also takes space
             before = len(done)
             time.sleep(0.002)
             quiet = quiet + 1 if len(done) == before and not session.waiting else 0

@@ -12,6 +12,7 @@ from drivers.client import NotSeenError, Rig
 from drivers.link import LinkTimeoutError
 from drivers.sources.samples import ALL_AVAILABLE, RowReader, Samples
 from rig.base.wire import STATUS, encode_block, encode_document, truth_key
+from tests.waiting import PATIENCE_S
 
 from .recorder_stream import ScriptedClient, make_block
 
@@ -123,5 +124,5 @@ def test_a_read_waits_for_rows_of_another_thread() -> None:
     reader = RowReader("a reader")
     adds = threading.Thread(target=lambda: [reader.add(part(10 * n, 10)) for n in range(3)])
     adds.start()
-    assert len(reader.read(30, timeout_s=60.0)) == 30
+    assert len(reader.read(30, timeout_s=PATIENCE_S)) == 30
     adds.join()

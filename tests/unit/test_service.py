@@ -21,7 +21,7 @@ from rig.serve.service import Service
 from rig.serve.transport import NoReplyError
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, TRUTH, FakeSimulation
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 BLOCK = 10_000
 
@@ -78,7 +78,7 @@ class Running:
         self.join()
 
     def join(self) -> None:
-        self._thread.join(30.0)
+        self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
 
     @property
@@ -260,7 +260,7 @@ def test_steps_of_several_clients_add_up() -> None:
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(20.0)
+            thread.join(PATIENCE_S)
         assert sorted(done) == [n * BLOCK for n in range(1, 9)]
 
 
@@ -381,7 +381,7 @@ class Gate(MemoryServer):
         self.open = threading.Event()
 
     def publish(self, key: str, payload: bytes) -> None:
-        assert self.open.wait(20.0)
+        assert self.open.wait(PATIENCE_S)
         super().publish(key, payload)
 
 
@@ -432,7 +432,7 @@ def test_an_unpaced_run_waits_for_the_publisher() -> None:
     time.sleep(0.05)
     assert simulation.tick <= 220_000, "one block in the queue's 20 places, one in the publisher's hands"
     server.open.set()
-    thread.join(20.0)
+    thread.join(PATIENCE_S)
     assert len(listener.blocks[wire.sensor_key("probes")]) == 100
     assert listener.statuses[-1]["queue"]["dropped"] == 0
 

@@ -37,7 +37,9 @@ except KeyboardInterrupt:
 
 
 def test_an_interrupt_that_a_callback_swallows_is_sent_again() -> None:
-    done = subprocess.run([sys.executable, "-c", SWALLOWED], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", SWALLOWED], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted True\n", "")
 
 

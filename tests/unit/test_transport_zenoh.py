@@ -23,7 +23,7 @@ from rig.serve.transport.endpoint import parse_endpoint, read_backlogs
 from rig.serve.transport.recovery import Recovery
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint
-from tests.waiting import time_limit, until
+from tests.waiting import PATIENCE_S, time_limit, until
 
 pytestmark = pytest.mark.wallclock
 
@@ -58,7 +58,7 @@ def test_the_port_is_free_again_after_close() -> None:
     for _ in range(2):
         with ZenohServer(endpoint) as server, ZenohClient(endpoint) as client:
             server.answer("rig/status", lambda _: b"yes")
-            assert client.request("rig/status", timeout_s=10.0) == b"yes"
+            assert client.request("rig/status", timeout_s=PATIENCE_S) == b"yes"
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind(("127.0.0.1", int(endpoint.rpartition(":")[2])))
@@ -86,7 +86,7 @@ def test_without_a_rig_the_error_names_the_endpoint_and_the_remedy() -> None:
 def test_a_command_waits_until_a_listening_rig_is_ready(server: ZenohServer) -> None:
     announced = threading.Timer(0.5, server.announce)
     announced.start()
-    with Connection(server.endpoint, wait_s=20.0).client() as client:
+    with Connection(server.endpoint, wait_s=PATIENCE_S).client() as client:
         assert client.tokens(ALIVE)
         assert announced.finished.is_set()
 
@@ -113,7 +113,7 @@ def test_a_client_waits_for_a_rig_that_starts_later() -> None:
     timer = threading.Timer(0.7, start)
     timer.start()
     try:
-        with ZenohClient(endpoint, wait_s=20.0):
+        with ZenohClient(endpoint, wait_s=PATIENCE_S):
             assert starts.is_set()
             timer.join()
             assert len(servers) == 1
@@ -132,7 +132,7 @@ def test_a_request_ends_when_its_rig_ends(server: ZenohServer) -> None:
 
     server.answer_all("rig/command/*", never)
     with ZenohClient(server.endpoint) as client:
-        goes = threading.Thread(target=lambda: (requested.wait(20.0), server.close()))
+        goes = threading.Thread(target=lambda: (requested.wait(PATIENCE_S), server.close()))
         goes.start()
         with pytest.raises(NoReplyError, match=f"^the link to the rig at {server.endpoint} was lost before"):
             client.request("rig/command/step", timeout_s=600.0)
@@ -169,13 +169,13 @@ def test_a_delayed_reply_does_not_delay_others(server: ZenohServer) -> None:
 
     server.answer_all("rig/command/*", handler)
     with ZenohClient(server.endpoint) as client, ThreadPoolExecutor(20) as pool:
-        slow = [pool.submit(client.request, "rig/command/slow", timeout_s=20.0) for _ in range(20)]
+        slow = [pool.submit(client.request, "rig/command/slow", timeout_s=PATIENCE_S) for _ in range(20)]
         until(lambda: len(later) == 20)
         assert client.request("rig/command/quick") == b"rig/command/quick"
         assert not any(reply.done() for reply in slow)
         for number, reply in enumerate(later):
             reply.set_result(str(number).encode())
-        assert sorted(int(reply.result(20.0)) for reply in slow) == list(range(20))
+        assert sorted(int(reply.result(PATIENCE_S)) for reply in slow) == list(range(20))
         with pytest.raises(NoReplyError, match="one key, without"):
             client.request("rig/command/*")
 
@@ -184,11 +184,11 @@ def test_every_first_request_is_answered(server: ZenohServer) -> None:
     server.answer("rig/status", lambda _: b"yes")
     for _ in range(20):
         with ZenohClient(server.endpoint) as client:
-            assert client.request("rig/status", timeout_s=10.0) == b"yes"
+            assert client.request("rig/status", timeout_s=PATIENCE_S) == b"yes"
 
 
 def test_the_first_request_waits_as_long_as_the_client_and_later_ones_do_not(server: ZenohServer) -> None:
-    with ZenohClient(server.endpoint, wait_s=60.0) as client:
+    with ZenohClient(server.endpoint, wait_s=PATIENCE_S) as client:
         starts = threading.Timer(0.5, lambda: server.answer("rig/status", lambda _: b"yes"))
         starts.start()
         assert client.request("rig/status", timeout_s=0.1) == b"yes"
@@ -478,7 +478,7 @@ def test_a_blocking_callback_delays_neither_requests_nor_recovery(
     go = threading.Event()
 
     def take(key: str, payload: bytes) -> None:
-        assert go.wait(60.0)
+        assert go.wait(PATIENCE_S)
         got[key].append(int.from_bytes(payload[:8], "little"))
 
     with ZenohServer(free_endpoint()) as server, ZenohClient(server.endpoint) as client:
@@ -488,7 +488,7 @@ def test_a_blocking_callback_delays_neither_requests_nor_recovery(
         for number in range(messages):
             for key in keys:
                 server.publish(key, number.to_bytes(8, "little") + bytes(2000))
-        assert client.request("rig/scene", timeout_s=20.0) == b"pong"
+        assert client.request("rig/scene", timeout_s=PATIENCE_S) == b"pong"
         server.announce()
         until(lambda: states == [True])
         go.set()
@@ -526,7 +526,7 @@ def test_a_lossy_subscriber_that_stalls_keeps_the_newest() -> None:
 
     def take(_: str, payload: bytes) -> None:
         entered.set()
-        go.wait(20.0)
+        go.wait(PATIENCE_S)
         got.append(int(payload))
 
     # A server that does not wait may drop the newest message itself, where the machine is busy.
@@ -559,7 +559,7 @@ def test_a_callback_that_raises_is_reported_and_does_not_block_the_link(
         client.subscribe("rig/**", take)
         for _ in range(25_000):
             server.publish("rig/status", b"x")
-        assert client.request("rig/scene", timeout_s=20.0) == b"pong"
+        assert client.request("rig/scene", timeout_s=PATIENCE_S) == b"pong"
     assert reported == [ZeroDivisionError]
 
 

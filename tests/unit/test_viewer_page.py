@@ -16,6 +16,7 @@ import pytest
 from recorder.viewer import page
 from recorder.viewer.canvas import SIMULATED
 from recorder.viewer.window import free_port
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.wallclock
 
@@ -54,12 +55,12 @@ def served() -> Iterator[tuple[page.Page, str]]:
 
 
 def post(address: str, body: bytes) -> str:
-    with urllib.request.urlopen(address, data=body, timeout=10) as reply:
+    with urllib.request.urlopen(address, data=body, timeout=PATIENCE_S) as reply:
         return reply.read().decode()
 
 
 def test_the_page_adds_a_script_and_uses_no_other_site(served: tuple[page.Page, str]) -> None:
-    with urllib.request.urlopen(served[1], timeout=10) as reply:
+    with urllib.request.urlopen(served[1], timeout=PATIENCE_S) as reply:
         body = reply.read()
         assert reply.url.endswith("/?url=x")
     assert b"viewer_state()" in body
@@ -92,7 +93,7 @@ def test_reports_of_other_sites_are_refused(served: tuple[page.Page, str], heade
     for data in (STATE, None) if "Host" in headers else (STATE,):
         request = urllib.request.Request(f"{served[1]}/state?a", data=data, headers=headers)
         with pytest.raises(urllib.error.HTTPError, match="400"):
-            urllib.request.urlopen(request, timeout=10)
+            urllib.request.urlopen(request, timeout=PATIENCE_S)
     assert served[0].get_processed_picture() is None
 
 
@@ -101,7 +102,7 @@ def test_a_browser_that_disconnects_prints_nothing(
     served: tuple[page.Page, str], begun: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
     host = served[1].removeprefix("http://")
-    with socket.create_connection(("127.0.0.1", int(host.partition(":")[2])), timeout=10) as browser:
+    with socket.create_connection(("127.0.0.1", int(host.partition(":")[2])), timeout=PATIENCE_S) as browser:
         browser.sendall(begun + b" HTTP/1.1\r\nHost: " + host.encode() + b"\r\nContent-Length: 9\r\n\r\na")
         browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it resets the connection
     assert post(f"{served[1]}/state?b", b"")
@@ -126,7 +127,7 @@ def test_a_browser_that_disconnects_prints_nothing(
 def test_invalid_reports_are_refused(
     served: tuple[page.Page, str], method: str, path: str, size: str, status: int
 ) -> None:
-    connection = http.client.HTTPConnection(served[1].removeprefix("http://"), timeout=10)
+    connection = http.client.HTTPConnection(served[1].removeprefix("http://"), timeout=PATIENCE_S)
     connection.request(method, path, headers={"Content-Length": size})
     assert connection.getresponse().status == status
     connection.close()

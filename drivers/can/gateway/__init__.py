@@ -381,7 +381,12 @@ class Gateway(Closing):
             if self.state == RigState.LOCKSTEP and self._last_sync is not None:
                 # Repeat Sync between steps: a node that joins then would otherwise wait for it in vain.
                 self.outbox.answer(self._messages["Sync"], **self._last_sync)
-            self.outbox.answer(self._messages["Clock"], seconds=self._time_us // 1_000_000 & _WORD_32)
+            self.outbox.answer(
+                self._messages["Clock"],
+                seconds=self._time_us // 1_000_000 & _WORD_32,
+                fd_messages=sum(each.message.fd for each in self._samples),
+                classic_messages=sum(not each.message.fd for each in self._samples),
+            )
             self.outbox.answer(
                 self._messages["Heartbeat"],
                 state=self.state,
