@@ -214,8 +214,8 @@ class CanSource:
             raise InputError("layout", "one that the rig sends", layout)
         self._layout_name = layout
         rows = self._table.fd if layout == "fd" else self._table.classic
-        # A run may lack groups: list the messages that have been seen; in lockstep, all that may come. Between the first
-        # and the last of a run's messages seconds pass on a busy machine.
+        # A run may lack groups: list the messages that have been seen; in lockstep, all that may come.
+        # On a busy machine seconds pass between the first and the last of a run's messages.
         count, stated = -1, self._numbers_of_messages[layout]
         for _ in Deadline(max(_SILENCE_TIMEOUT_S, self._wait_s)).polls(_QUIET_S):
             seen = sum(row.identifier in self._seen_identifiers for row in rows)
