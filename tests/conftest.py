@@ -5,6 +5,8 @@ processed by one worker. Tests within a process come first; the pages of the doc
 start real rigs, follow, when that engine is compiled. A second worker compiles all engines one after another, because
 two that compile at the same time would both compile the shared parts. A third worker runs the tools and other modules
 that need no engine until the default engine is compiled. All other modules follow, the longest first.
+
+Without a file or folder, `pytest` leaves out the long tests (`tests.long_tests`); `pytest tests` runs all.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import pytest
 
 import rig.physics.kernels  # noqa: F401 - names the cache of compiled code
 from rig.channels import table
+from tests import long_tests
 
 ROOT = Path(__file__).parents[1]
 SHIPPED_TABLE = "RIG_TESTS_SHIPPED_TABLE"
@@ -30,6 +33,10 @@ SHIPPED_TABLE = "RIG_TESTS_SHIPPED_TABLE"
 if SHIPPED_TABLE not in os.environ:
     assert not table.default_table.cache_info().currsize
     table.TABLE = ROOT / "tests/channels.toml"
+WORKER_SETTING = "rig_long_tests"
+"""Key for workers: whether to run the long tests."""
+COSTS = "RIG_TEST_COSTS"
+"""Environment: file to which each test appends its processor time."""
 COMPILING = "tests/parity/test_compiling.py"
 TOOLS = "tests/house/test_tools.py"
 PAGES = "tests/system/test_pages.py"
@@ -40,6 +47,12 @@ WITHOUT_ENGINE = (
     "tests/house/test_sizes.py",
     "tests/house/test_contracts.py",
     "tests/unit/test_score_track.py",
+    "tests/unit/test_log_defects.py",
+    "tests/unit/test_time_order.py",
+    "tests/unit/test_recorder_health.py",
+    "tests/unit/test_guess.py",
+    "tests/unit/test_score_bits.py",
+    "tests/unit/test_import_defects.py",
 )
 """Modules that run no engine, for as long as the default engine compiles (75 s of processor time). A rig or a test that
 runs an engine during this time would compile it as well, and take 40 s of processor time for it."""
@@ -127,8 +140,33 @@ def pytest_configure(config: pytest.Config) -> None:
             signal.signal(number, usual)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def _runs_long_tests(config: pytest.Config) -> bool:
+    """Return whether files or folders were given; a worker, which is always given some, asks the main process."""
+    given = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
+    return getattr(config, "workerinput", {}).get(WORKER_SETTING, given)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    node.workerinput[WORKER_SETTING] = _runs_long_tests(node.config)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not _runs_long_tests(config):
+        items[:], left_out = long_tests.split(items)
+        config.hook.pytest_deselected(items=left_out)
     items.sort(key=lambda item: _place(item.nodeid))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    begin_s = long_tests.processor_time_s()
+    try:
+        return (yield)
+    finally:
+        if COSTS in os.environ:
+            seconds = long_tests.processor_time_s() - begin_s
+            long_tests.append_cost(Path(os.environ[COSTS]), item.nodeid, seconds)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -214,7 +214,9 @@ def test_the_readme_has_two_install_commands() -> None:
     assert set(commands) == {"demo command", "test command"}
     create = r"python3 -m venv \.venv && \.venv/bin/pip install -q "
     assert re.fullmatch(rf"{create}'\.\[\w+\]' && .*\n", commands["demo command"])
-    assert re.fullmatch(rf"{create}--require-hashes .*\n.*pip install .* -e \. && .*\n", commands["test command"])
+    assert re.fullmatch(
+        rf"{create}--no-compile --require-hashes .*\n.*pip install .* -e \. && .*\n", commands["test command"]
+    )
 
 
 def find_commands(text: str) -> Iterator[list[str]]:
