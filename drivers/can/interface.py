@@ -68,6 +68,7 @@ class ZenohBus(NodeBus):
             self.client = ZenohClient(self._address, wait_s=self._connect_s)
         except NoReplyError:
             raise can.CanInitializationError(self._describe_missing_hub()) from None
+        self.client.await_token(codec.ALIVE)
         self.client.announce(codec.node_key(self.channel, self.name))
         self.client.subscribe(
             codec.bus_key(self.channel),

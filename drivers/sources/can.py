@@ -34,6 +34,10 @@ _SILENCE_TIMEOUT_S = 3.0
 _BATCH_S = 0.01
 _QUIET_S = 0.05
 """Silence after which no further kind of sample message is expected, if the rig does not state their number."""
+_FIRST_FRAMES_TIMEOUT_S = 5.0
+"""Longest wait for the first frame of each sample message that the rig states; a busy machine needs a second."""
+_EARLY_S = 1.0
+"""Time before the start of the streams from which frames are passed on [s]."""
 _MAX_EARLY_FRAMES = 50_000
 """Buffered frames before Rates and Sync: about 5 s of all messages."""
 _TICK_RATE_HZ = 1e6
@@ -164,7 +168,7 @@ class CanSource:
         self.table = self._table = table or default_messages()
         self._on_frame = on_frame
         self._other_layout = 0
-        self._wait_s = wait_s
+        self._wait_s, self._opening = wait_s, Deadline(wait_s)
         self._bus = open_bus(spec, interface, channel, **settings)
         self._lock = threading.RLock()
         self.rates: dict[str, int] | None = None
@@ -185,7 +189,7 @@ class CanSource:
         self._is_restarted = False
         self._end_reason: str | None = None
         self._rates_known = threading.Event()
-        self._early: deque[tuple[int, bytes]] = deque(maxlen=_MAX_EARLY_FRAMES)
+        self._early: deque[tuple[float, int, bytes]] = deque(maxlen=_MAX_EARLY_FRAMES)
         self._batch: dict[int, list[bytes]] = {}
         self._decoder: SampleDecoder | None = None
         self._wanted: dict[int, str] = {}
@@ -215,13 +219,12 @@ class CanSource:
         self._layout_name = layout
         rows = self._table.fd if layout == "fd" else self._table.classic
         # A run may lack groups: list the messages that have been seen; in lockstep, all that may come.
-        # On a busy machine seconds pass between the first and the last of a run's messages.
-        count, stated = -1, self._numbers_of_messages[layout]
-        for _ in Deadline(max(_SILENCE_TIMEOUT_S, self._wait_s)).polls(_QUIET_S):
+        before, stated = 0, self._numbers_of_messages[layout]
+        for _ in Deadline(_FIRST_FRAMES_TIMEOUT_S).polls(_QUIET_S):
             seen = sum(row.identifier in self._seen_identifiers for row in rows)
-            if self.lockstep or self._end_reason is not None or seen >= (stated or count) > 0:
+            if self.lockstep or self._end_reason is not None or (seen >= stated if stated else 0 < seen == before):
                 break
-            count = max(1, seen)
+            before = seen
         return {
             row.name: tuple(channel.name for channel in row.samples.channels)
             for row in rows
@@ -234,7 +237,8 @@ class CanSource:
         Raises:
             InputError: No rig is on that bus.
         """
-        if not self._rates_known.wait(self._wait_s) or self.rates is None:
+        left_s = max(self._opening.left_s, min(self._wait_s, _SILENCE_TIMEOUT_S))
+        if not self._rates_known.wait(left_s) or self.rates is None:
             must = f"a bus with a rig on it (no Clock, Rates and Sync in {self._wait_s:g} s)"
             raise InputError("can", must, self._bus.channel_info)
 
@@ -262,7 +266,7 @@ class CanSource:
         on_samples: Callable[[str, Samples], None],
         on_end: Callable[[str, str], None],
     ) -> float:
-        """Start the streams, with the frames that have arrived since the source was opened."""
+        """Start the streams, with the frames of the last second since the source was opened."""
         rates = self.rates
         assert rates is not None
         self._started = (rates["rate"], rates[f"{self._layout_name}_step"])
@@ -271,12 +275,14 @@ class CanSource:
         with self._lock:
             self._decoder = SampleDecoder({name: self._table.by_name[name] for name in streams}, decimation)
             self._wanted = {self._identifiers[name]: name for name in streams}
-            self._on_samples, self._on_end = on_samples, on_end
+            self._on_samples, self._on_end, ended = on_samples, on_end, self._end_reason
             early, self._early = self._early, deque(maxlen=1)
-            for identifier, data in early:
-                if identifier in self._wanted:
+            for arrival_s, identifier, data in early:
+                if identifier in self._wanted and arrival_s >= early[-1][0] - _EARLY_S:
                     self._batch.setdefault(identifier, []).append(data)
             self.deliver()
+        if ended is not None:
+            self._finish(ended)
         return native / decimation
 
     def _read(self) -> None:
@@ -316,7 +322,7 @@ class CanSource:
             with self._lock:
                 if self._on_samples is None:
                     self._seen_identifiers[identifier] = None
-                    self._early.append((identifier, data))
+                    self._early.append((time.monotonic(), identifier, data))
                 elif identifier in self._wanted:
                     self._batch.setdefault(identifier, []).append(data)
             return None

@@ -22,13 +22,13 @@ SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
     "drivers": 714,
-    "drivers/can": 4548,
+    "drivers/can": 4556,
     "drivers/daqmx": 1316,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
     "drivers/protection": 683,
-    "drivers/sources": 1001,
+    "drivers/sources": 1006,
     "recorder": 1358,
     "recorder/contents": 1268,
     "recorder/files": 831,
@@ -52,7 +52,7 @@ BUDGETS = {
     "rig/ensemble": 2039,
     "rig/physics": 5488,
     "rig/run": 1900,
-    "rig/serve": 3076,
+    "rig/serve": 3080,
 }
 _NO_CODE = (
     tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER,

@@ -13,10 +13,11 @@ import pytest
 
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
-from drivers.can.signals import default_messages
+from drivers.can.signals import RigState, default_messages
 from drivers.daq import Daq
 from drivers.sources.can import CanSource, full_index
 from drivers.sources.can_client import CanClient
+from drivers.sources.samples import Samples
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import default_table
@@ -140,25 +141,62 @@ def test_a_client_that_joins_after_a_clock_waits_for_the_next(name: str, raw: di
         source.wait()
 
 
-@pytest.mark.parametrize("last", ["Samples_2", None])
-def test_a_busy_machine_delays_the_samples_of_a_run_but_hides_none(
-    last: str | None, monkeypatch: pytest.MonkeyPatch
+def take_first_frames(source: CanSource, *, stated: int) -> None:
+    """Pass the frames of a rig up to its first sample message."""
+    for name, raw in (("Clock", {"classic_messages": stated}), ("Rates", RATES), ("Sync", {}), ("Samples_1", {})):
+        row = default_messages().by_name[name]
+        source.take(row.identifier, row.encode(**raw))
+
+
+def pass_later(source: CanSource, name: str, after_s: float) -> None:
+    row = default_messages().by_name[name]
+    threading.Timer(after_s, source.take, (row.identifier, row.encode())).start()
+
+
+def test_a_busy_machine_delays_the_samples_of_a_run_but_hides_none() -> None:
+    with closing(CanSource("virtual:busy")) as source:
+        take_first_frames(source, stated=2)
+        pass_later(source, "Samples_2", 0.5)
+        assert list(source.streams()) == ["Samples_1", "Samples_2"]
+
+
+def test_without_their_number_sample_messages_are_awaited_until_none_is_new() -> None:
+    """A rig of an earlier version, or its log, states none."""
+    with closing(CanSource("virtual:earlier")) as source:
+        take_first_frames(source, stated=0)
+        pass_later(source, "Samples_2", 0.02)
+        assert list(source.streams()) == ["Samples_1", "Samples_2"]
+
+
+def test_a_silenced_message_is_not_awaited_for_ever_and_old_frames_are_not_passed_on(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("drivers.sources.can._SILENCE_TIMEOUT_S", 0.3)
-    with closing(CanSource("virtual:busy", wait_s=0.0 if last is None else PATIENCE_S)) as source:
+    monkeypatch.setattr("drivers.sources.can._FIRST_FRAMES_TIMEOUT_S", 0.3)
+    monkeypatch.setattr("drivers.sources.can._EARLY_S", 0.1)
+    found: list[Samples] = []
+    with closing(CanSource("virtual:silenced", wait_s=PATIENCE_S)) as source:
+        take_first_frames(source, stated=2)
+        assert list(source.streams()) == ["Samples_1"]
+        row = default_messages().by_name["Samples_1"]
+        source.take(row.identifier, row.encode(index=7))
+        source.start(["Samples_1"], None, lambda _, samples: found.append(samples), lambda *_: None)
+        assert [samples.index for samples in found] == [7]
 
-        def take(name: str, **raw: int) -> None:
-            row = default_messages().by_name[name]
-            source.take(row.identifier, row.encode(**raw))
 
-        take("Clock", classic_messages=2)
-        take("Rates", **RATES)
-        take("Sync", index=0, time=0)
-        take("Samples_1", index=0)
-        late = threading.Timer(0.5, take, (last,), {"index": 0})
-        if last is not None:
-            late.start()
-        assert list(source.streams()) == ["Samples_1", last][: 1 if last is None else 2]
+def test_a_run_that_has_ended_before_the_streams_start_ends_them() -> None:
+    ends: list[tuple[str, str]] = []
+    beat = default_messages().by_name["Heartbeat"]
+    with (
+        closing(CanSource("virtual:ended")) as source,
+        can.Bus("ended", interface="virtual", ignore_config=True) as rig,
+    ):
+        take_first_frames(source, stated=1)
+        source.streams()
+        data = beat.encode(state=RigState.ENDED)
+        rig.send(can.Message(arbitration_id=beat.identifier, data=data, is_extended_id=False))
+        until(lambda: not any(each.name == "can ended reads" for each in threading.enumerate()))
+        source.start(["Samples_1"], None, lambda *_: None, lambda *end: ends.append(end))
+    assert ends == [("Samples_1", "the rig's run has ended")]
 
 
 def test_an_index_is_the_nearest_with_its_low_32_bits() -> None:

@@ -21,7 +21,7 @@ from rig.cli.connections.connection import Connection
 from rig.serve.transport import NoReplyError
 from rig.serve.transport.endpoint import parse_endpoint, read_backlogs
 from rig.serve.transport.recovery import Recovery
-from rig.serve.transport.zenoh import ZenohClient, ZenohServer
+from rig.serve.transport.zenoh import ZenohClient, ZenohServer, connect_url
 from tests.processes import free_endpoint
 from tests.waiting import PATIENCE_S, time_limit, until
 
@@ -187,12 +187,16 @@ def test_every_first_request_is_answered(server: ZenohServer) -> None:
             assert client.request("rig/status", timeout_s=PATIENCE_S) == b"yes"
 
 
-def test_the_first_request_waits_as_long_as_the_client_and_later_ones_do_not(server: ZenohServer) -> None:
-    with ZenohClient(server.endpoint, wait_s=PATIENCE_S) as client:
-        starts = threading.Timer(0.5, lambda: server.answer("rig/status", lambda _: b"yes"))
-        starts.start()
+def test_a_client_of_a_url_waits_until_a_listening_rig_is_ready_and_then_no_longer(server: ZenohServer) -> None:
+    def start() -> None:
+        server.answer("rig/status", lambda _: b"yes")
+        server.announce()
+
+    starts = threading.Timer(0.5, start)
+    starts.start()
+    with connect_url(server.endpoint, wait_s=PATIENCE_S) as client:
         assert client.request("rig/status", timeout_s=0.1) == b"yes"
-        with time_limit(30.0), pytest.raises(NoReplyError):
+        with time_limit(PATIENCE_S / 2), pytest.raises(NoReplyError):
             client.request("rig/nothing", timeout_s=0.1)
 
 

@@ -115,6 +115,10 @@ class Gateway(Closing):
         self._messages, self._layout = schedule.table.by_name, schedule.table.layout
         self._rate_hz, self._steps = find_decimations(table, schedule)
         self._samples = make_sample_frames(table, schedule, self._steps)
+        self._numbers_of_messages = {
+            f"{layout}_messages": sum(each.message.fd == fd for each in self._samples)
+            for layout, fd in (("fd", True), ("classic", False))
+        }
         self._groups = tuple(table.groups)
         self._queue_seconds = queue_seconds
         self._changed = threading.Condition()
@@ -384,8 +388,7 @@ class Gateway(Closing):
             self.outbox.answer(
                 self._messages["Clock"],
                 seconds=self._time_us // 1_000_000 & _WORD_32,
-                fd_messages=sum(each.message.fd for each in self._samples),
-                classic_messages=sum(not each.message.fd for each in self._samples),
+                **self._numbers_of_messages,
             )
             self.outbox.answer(
                 self._messages["Heartbeat"],

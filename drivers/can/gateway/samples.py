@@ -9,7 +9,7 @@ from drivers.can.message import ABSENT, CanMessage
 from drivers.can.schedule import Schedule
 from drivers.can.signals import find_mismatch
 from rig.base import wire
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 from rig.channels.table import ChannelTable
 
 _MAX_WAITING_ROWS = 50_000
@@ -102,6 +102,10 @@ def find_decimations(table: ChannelTable, schedule: Schedule) -> tuple[int, dict
     can_channels = {each.name: each for row in schedule.table.fd if row.samples for each in row.samples.channels}
     if (name := find_mismatch(table, can_channels)) is not None:
         raise InputError(f"channel {name}", "calibrated as in the channel table of the messages", name)
+    for name, channel in can_channels.items():
+        if channel.group in table.groups and name not in table.groups[channel.group].names:
+            must = f"sent with its group, {channel.group}, on a CAN bus"
+            raise InputError(f"channel {name}", must, Words("no such channel"))
     decimations = {}
     for fd, wanted in ((True, schedule.fd_hz), (False, schedule.classic_hz)):
         if wanted is not None:

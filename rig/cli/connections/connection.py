@@ -57,17 +57,14 @@ class Connection:
         """
         from rig.base.wire import ALIVE
         from rig.serve.transport.zenoh import ZenohClient
-        from rig.serve.waiting import Deadline
 
         from_environment = self.tls is not None and os.environ.get(_TLS) == str(self.tls)
-        deadline = Deadline(self.wait_s)
         try:
             with ExitStack() as stack:
                 with self._show_waiting() if self.wait_s else nullcontext():
                     wait_s = max(_LINK_S, self.wait_s)
                     client = stack.enter_context(ZenohClient(self.connect, wait_s=wait_s, tls=self.tls))
-                    # A rig that is still starting already listens.
-                    any(client.tokens(ALIVE) for _ in deadline.polls(0.1))
+                    client.await_token(ALIVE)
                 yield client
         except NoReplyError as error:
             source = f" (the keys are those of {_TLS})" if from_environment and str(self.tls) in str(error) else ""

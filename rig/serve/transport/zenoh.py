@@ -62,8 +62,6 @@ _REMOTE_LIMITS = {"transport/unicast/max_sessions": 32, "transport/unicast/accep
 _OPENING_S, _OPENING_TLS_S, _RESTART_S = 0.5, 2.0, 5.0
 """Time limits: one attempt to connect, on the loopback and beyond it (several round trips), and the wait of a request
 without a link for a restarted rig [s]."""
-_LONGEST_REQUEST_S = 86_400.0
-"""Longest wait for the first reply, if the client waits for a rig without end [s]."""
 _RETRY_S = 0.05
 """Pause before an unanswered request is repeated [s]."""
 
@@ -278,7 +276,7 @@ class ZenohClient(Closing):
 
     Args:
         endpoint: HOST:PORT of the rig, or its name.
-        wait_s: Longest wait for a rig and its first reply [s]; may be infinite. A rig listens before it can reply.
+        wait_s: Longest wait for a rig [s]; may be infinite.
         tls: Folder with the keys of a role (`rig keys init`), for an exposed rig; None connects without TLS.
 
     Raises:
@@ -287,7 +285,7 @@ class ZenohClient(Closing):
     """
 
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0, tls: Path | str | None = None) -> None:
-        self._opening, self._is_answered = Deadline(wait_s), False
+        self._opening = Deadline(wait_s)
         self._host, self._port = resolve_endpoint(endpoint, field="connect", wait_s=wait_s)
         self._holder: Holder | None = None
         if tls is not None:
@@ -466,19 +464,12 @@ class ZenohClient(Closing):
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Send a request to the rig and return its reply.
 
-        Args:
-            key: Key of the request.
-            payload: Content of the request.
-            timeout_s: Longest wait for the reply [s]; for the first, at least until the end of the client's `wait_s`.
-
         Raises:
             NoReplyError: There was no reply in time, or the rig failed or ended; it may have executed the request.
         """
         import zenoh
 
         role, key = self._role, bind_key(self._role, key)
-        if not self._is_answered:
-            timeout_s = max(timeout_s, min(self._opening.left_s, _LONGEST_REQUEST_S))
         deadline, restart_deadline, linked = (
             Deadline(timeout_s),
             Deadline(min(timeout_s, _RESTART_S)),
@@ -497,7 +488,6 @@ class ZenohClient(Closing):
             for reply in replies:
                 payload_back = reply.result.payload.to_bytes()
                 if reply.ok is not None:
-                    self._is_answered = True
                     return payload_back
                 if (text := payload_back.decode(errors="replace")) != "Timeout":
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
@@ -530,6 +520,10 @@ class ZenohClient(Closing):
         """Publish a token of this client; it disappears when this process ends for any reason."""
         self._declared.append(self._session.session.liveliness().declare_token(key))
 
+    def await_token(self, key: str) -> None:
+        """Wait until a token exists, at most until the end of `wait_s`: a rig listens before it can reply."""
+        any(self.tokens(key) for _ in self._opening.polls(0.1))
+
     def tokens(self, key: str, *, timeout_s: float = 0.5) -> list[str]:
         """Return the keys of matching tokens that exist now."""
         replies = self._session.session.liveliness().get(key, timeout=timeout_s)
@@ -555,6 +549,17 @@ class ZenohClient(Closing):
 
 
 def connect_url(url: str, *, wait_s: float) -> ZenohClient:
-    """Return a client of the rig at a URL (see `names.parse_url`), with the keys of a role in ?tls=DIR."""
+    """Return a client of the rig at a URL (see `names.parse_url`), with the keys of a role in ?tls=DIR.
+
+    Raises:
+        InputError: The URL is malformed.
+        NoReplyError: No rig listens there after `wait_s`; one that listens may still be starting then.
+    """
     endpoint, query, folder = parse_url(url).partition("?tls=")
-    return ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)
+    client = ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)
+    try:
+        client.await_token(wire.ALIVE)
+    except BaseException:
+        client.close()
+        raise
+    return client
