@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 LIST = Path(__file__).with_suffix(".txt")
-TIME_LIMIT_S = 1.5
+TIME_LIMIT_S = 0.8
 """Longest processor time of a test in a run of ten minutes [s]."""
 WHOLE_MODULES = ("tests/unit/test_paper.py",)
 """Modules whose tests share a result that takes a minute."""

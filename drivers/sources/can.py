@@ -36,7 +36,7 @@ _QUIET_S = 0.05
 """Silence after which no further kind of sample message is expected, if the rig does not state their number."""
 _FIRST_FRAMES_TIMEOUT_S = 5.0
 """Longest wait for the first frame of each sample message that the rig states; a busy machine needs a second."""
-_EARLY_S = 1.0
+_LEAD_S = 1.0
 """Time before the start of the streams from which frames are passed on [s]."""
 _MAX_EARLY_FRAMES = 50_000
 """Buffered frames before Rates and Sync: about 5 s of all messages."""
@@ -278,7 +278,7 @@ class CanSource:
             self._on_samples, self._on_end, ended = on_samples, on_end, self._end_reason
             early, self._early = self._early, deque(maxlen=1)
             for arrival_s, identifier, data in early:
-                if identifier in self._wanted and arrival_s >= early[-1][0] - _EARLY_S:
+                if identifier in self._wanted and arrival_s >= early[-1][0] - _LEAD_S:
                     self._batch.setdefault(identifier, []).append(data)
             self.deliver()
         if ended is not None:

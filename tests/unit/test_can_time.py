@@ -172,7 +172,7 @@ def test_a_silenced_message_is_not_awaited_for_ever_and_old_frames_are_not_passe
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("drivers.sources.can._FIRST_FRAMES_TIMEOUT_S", 0.3)
-    monkeypatch.setattr("drivers.sources.can._EARLY_S", 0.1)
+    monkeypatch.setattr("drivers.sources.can._LEAD_S", 0.1)
     found: list[Samples] = []
     with closing(CanSource("virtual:silenced", wait_s=PATIENCE_S)) as source:
         take_first_frames(source, stated=2)
