@@ -44,19 +44,11 @@ def read_list() -> list[str]:
 
 
 def split(items: Iterable[pytest.Item]) -> tuple[list[pytest.Item], list[pytest.Item]]:
-    """Split tests into short and long ones.
-
-    Raises:
-        UsageError: The list names a test that does not exist.
-    """
+    """Split tests into short and long ones."""
     short, long, names = list[pytest.Item](), list[pytest.Item](), set(read_list())
-    found = set[str]()
     for item in items:
-        matching = {item.nodeid, _function(item.nodeid), _module(item.nodeid)} & names
-        found |= matching
-        (long if matching else short).append(item)
-    if names - found:
-        raise pytest.UsageError(f"{LIST.name} names tests that do not exist: {', '.join(sorted(names - found))}")
+        is_long = not names.isdisjoint({item.nodeid, _function(item.nodeid), _module(item.nodeid)})
+        (long if is_long else short).append(item)
     return short, long
 
 
