@@ -73,6 +73,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
             with pytest.raises(InputError, match=r"url must be \[zenoh:\]HOST:PORT\[\?tls=DIR\], or the name of a rig"):
                 connect(url)
     with ZenohServer("127.0.0.1:0") as server:
+        server.announce()
         for url in (server.endpoint, f"zenoh:{server.endpoint}"):
             connect_url(url, wait_s=PATIENCE_S).close()
 
