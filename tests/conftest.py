@@ -160,13 +160,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    if COSTS not in os.environ:
+        return (yield)
     begin_s = long_tests.processor_time_s()
     try:
         return (yield)
     finally:
-        if COSTS in os.environ:
-            seconds = long_tests.processor_time_s() - begin_s
-            long_tests.append_cost(Path(os.environ[COSTS]), item.nodeid, seconds)
+        long_tests.append_cost(Path(os.environ[COSTS]), item.nodeid, long_tests.processor_time_s() - begin_s)
 
 
 @pytest.hookimpl(wrapper=True)
